@@ -1,0 +1,110 @@
+"""What a robots/<name>/robot.toml may say, and where robots and their URDFs are found."""
+
+import importlib.metadata
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from slomo.errors import InvalidData, UsageError
+
+QUADRUPED_LIMBS = ("front_left", "front_right", "hind_left", "hind_right")
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class UrdfSection(_Strict):
+    """`path` is inside the data of the installed `package`, or without one relative to the robot.toml."""
+
+    path: str
+    package: str | None = None
+
+
+class FramesSection(_Strict):
+    base: str
+
+
+class LimbSection(_Strict):
+    """Frames of one limb; `foot_radius` (m) only where the URDF's foot has no collision sphere."""
+
+    name: str
+    hip: str
+    foot: str
+    foot_radius: float | None = Field(default=None, gt=0)
+
+
+class RobotFile(_Strict):
+    """The whole file. Keys of `nominal` and `limits` are joint names, `*` matches any part of one."""
+
+    name: str
+    kind: Literal["quadruped", "humanoid"]
+    urdf: UrdfSection
+    frames: FramesSection
+    limbs: list[LimbSection] = Field(min_length=1)
+    nominal: dict[str, float]
+    limits: dict[str, tuple[float, float]] = {}
+    point_foot: dict[str, Any] = {}
+
+
+def robot_folders() -> dict[str, Path]:
+    """Name -> robot.toml, from the checkout's robots/ or from the installed package."""
+    here = Path(__file__).parent
+    roots = (here / "robots", here.parents[1] / "robots")
+    return {f.parent.name: f for root in roots for f in sorted(root.glob("*/robot.toml"))}
+
+
+def find_robot_file(name_or_path: str) -> Path:
+    """Path of the robot.toml that is meant. Raises `UsageError` listing the known names."""
+    known = robot_folders()
+    if name_or_path in known:
+        return known[name_or_path]
+    path = Path(name_or_path)
+    if path.is_file():
+        return path
+    if path.suffix == ".toml":
+        raise UsageError("no such file", where=name_or_path, todo="give a robot.toml or a known name")
+    raise UsageError(
+        f"no robot named {name_or_path!r}", where="--robot", valid=sorted(known), todo="or give a path to a robot.toml"
+    )
+
+
+def read_robot_file(path: Path) -> RobotFile:
+    """Parse and check. Raises `InvalidData` naming the first wrong entry."""
+    try:
+        data = tomllib.loads(path.read_text())
+        parsed = RobotFile.model_validate(data)
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
+        raise InvalidData(f"is not TOML: {e}", where=path) from None
+    except ValidationError as e:
+        first = e.errors()[0]
+        raise InvalidData(f"{'.'.join(map(str, first['loc']))}: {first['msg']}", where=path) from None
+    names = tuple(limb.name for limb in parsed.limbs)
+    if len(set(names)) != len(names):
+        raise InvalidData("limb names repeat", where=path)
+    if parsed.kind == "quadruped" and names != QUADRUPED_LIMBS:
+        raise InvalidData(f"limbs of a quadruped are {names}", where=path, valid=QUADRUPED_LIMBS)
+    return parsed
+
+
+def find_urdf(section: UrdfSection, robot_file: Path) -> tuple[Path, tuple[Path, ...]]:
+    """The URDF's path and the folders in which its package:// addresses are looked up."""
+    if section.package is None:
+        urdf = (robot_file.parent / section.path).resolve()
+        if not urdf.is_file():
+            raise InvalidData(f"urdf.path {section.path!r} is not a file", where=robot_file)
+        return urdf, (urdf.parent, *urdf.parents[1:4])
+    try:
+        files = importlib.metadata.files(section.package) or []
+    except importlib.metadata.PackageNotFoundError:
+        raise InvalidData(
+            f"the package {section.package!r} is not installed", where=robot_file, todo=f"pip install {section.package}"
+        ) from None
+    for f in files:
+        if str(f).endswith(f"share/{section.package}/package.xml"):
+            root = Path(str(f.locate())).resolve().parent
+            if (root / section.path).is_file():
+                return root / section.path, (root.parent,)
+    raise InvalidData(f"{section.path!r} is not in the package {section.package!r}", where=robot_file)
