@@ -1,0 +1,145 @@
+"""Feet that stand still while they stand: ground drift, stance detection, leg odometry, anchoring."""
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d, median_filter, minimum_filter1d
+
+Intervals = list[tuple[int, int]]
+
+
+def lifts(
+    height: np.ndarray, pairs: tuple[tuple[int, ...], ...], *, dt: float, window: float, most: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Height of each foot over the ground, and how the ground itself seems to rise and sink.
+
+    Each foot has a floor of its own (its 15th percentile: key points sit at different heights in different paws). With
+    one camera the ground also drifts and tilts over the clip: some foot of each pair stands within any `window`, so the
+    lower envelope of a pair is the ground there, unless it is higher than drift can be (both front feet of a creature
+    that rears).
+
+    Args:
+        height: (T, F) m.  pairs: columns of the front and of the hind feet.
+        dt: s.  window: s, longer than any flight phase.  most: m, greatest drift.
+
+    Returns:
+        (T, F) m over the ground, >= 0, and (T,) m, the mean ground's height in the input's frame.
+    """
+    floor = np.percentile(height, 15, axis=0)
+    over = height - floor
+    n = max(1, round(window / dt)) | 1
+    ground = np.zeros_like(over)
+    for pair in pairs:
+        low = minimum_filter1d(over[:, list(pair)].min(axis=1), n, mode="nearest")
+        low = gaussian_filter1d(np.where(np.abs(low) > most, 0.0, low), window / dt / 2, mode="nearest")
+        ground[:, list(pair)] = low[:, None]
+    over = over - ground
+    rest = np.percentile(over, 15, axis=0)
+    return np.maximum(over - rest, 0), ground.mean(axis=1) + float(np.median(floor + rest))
+
+
+def stance(lift: np.ndarray, speed: np.ndarray, *, dt: float, clearance: float, shortest: float) -> np.ndarray:
+    """Which feet stand, without any assumption about the gait.
+
+    A foot stands when it is low and slow. Slow is relative to the same foot's swing, because reconstructed feet slide.
+
+    Args:
+        lift: (T, F) m over the foot's floor.  speed: (T, F) m/s, horizontal.
+        dt: s.  clearance: m, a foot lifted more than this swings.  shortest: s, shorter stances and swings are noise.
+
+    Returns:
+        (T, F) bool.
+    """
+    swing = np.percentile(speed, 95, axis=0)
+    slow = speed < np.maximum(0.35 * swing, 0.12)
+    n = max(1, round(shortest / dt)) | 1
+    return median_filter((slow & (lift < clearance)).astype(np.uint8), (n, 1), mode="nearest").astype(bool)
+
+
+def runs(standing: np.ndarray) -> Intervals:
+    """(start, end) of the runs of True in (T,), end exclusive."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], standing.astype(int), [0]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def slide(xy: np.ndarray, weight: np.ndarray, *, dt: float, smoothing: float) -> np.ndarray:
+    """Path (T, 2) by which everything slides over the ground, judged by the feet that stand.
+
+    Depth from one camera drifts, so a whole reconstruction slides. Standing feet do not: their common velocity (the
+    weighted geometric median over feet, so that one swinging foot is outvoted) is the slide. Subtract the result from
+    every key point.
+
+    Args:
+        xy: (T, F, 2) m.  weight: (T, F) >= 0, how surely each foot stands.  dt: s.
+        smoothing: s, standard deviation of a Gaussian.
+    """
+    velocity = np.gradient(xy, dt, axis=0)
+    total = weight.sum(axis=1)
+    # A ground that does not slide has half a vote.
+    velocity = np.concatenate([velocity, np.zeros((len(xy), 1, 2))], axis=1)
+    w = np.concatenate([weight / np.maximum(total, 1e-12)[:, None], np.full((len(xy), 1), 0.5)], axis=1)
+    w /= w.sum(axis=1)[:, None]
+    common = np.sum(w[..., None] * velocity, axis=1)
+    for _ in range(20):  # Weiszfeld's iteration
+        far = np.maximum(np.linalg.norm(velocity - common[:, None], axis=2), 1e-3)
+        common = np.sum((w / far)[..., None] * velocity, axis=1) / np.sum(w / far, axis=1)[:, None]
+    known = np.flatnonzero(total > 0.2)
+    if not len(known):
+        return np.zeros((len(xy), 2))
+    frames = np.arange(len(xy))
+    common = np.stack([np.interp(frames, known, common[known, c]) for c in range(2)], axis=1)
+    common = gaussian_filter1d(common, smoothing / dt, axis=0, mode="nearest")
+    return np.concatenate([np.zeros((1, 2)), np.cumsum((common[1:] + common[:-1]) / 2 * dt, axis=0)])
+
+
+def split(xy: np.ndarray, standing: np.ndarray, *, dt: float, tolerance: float, step: float) -> np.ndarray:
+    """Break stances during which a foot creeps further than 2 * `tolerance` (m) by steps of `step` (s).
+
+    A foot cannot creep; where the creature shuffled, the robot takes a step at the moment of fastest creep.
+
+    Args:
+        xy: (T, 2) m, path of one foot.  standing: (T,) bool.
+
+    Returns:
+        (T,) bool.
+    """
+    out = standing.copy()
+    half = max(1, round(step / dt / 2))
+    speed = np.linalg.norm(np.gradient(gaussian_filter1d(xy, half, axis=0, mode="nearest"), dt, axis=0), axis=1)
+    todo = runs(standing)
+    while todo:
+        start, end = todo.pop()
+        part = xy[start:end]
+        if end - start < 6 * half or np.linalg.norm(part - np.median(part, axis=0), axis=1).max() <= tolerance:
+            continue
+        middle = start + 2 * half + int(np.argmax(speed[start + 2 * half : end - 2 * half]))
+        out[middle - half : middle + half] = False
+        todo += [(start, middle - half), (middle + half, end)]
+    return out
+
+
+def anchor(xy: np.ndarray, standing: np.ndarray) -> np.ndarray:
+    """One place for each stance; what that moves is blended over the swings before and after.
+
+    Args:
+        xy: (T, 2) m, path of one foot.  standing: (T,) bool.
+
+    Returns:
+        (T, 2), constant over each stance.
+    """
+    shift, known = np.zeros_like(xy), np.zeros(len(xy), bool)
+    for start, end in runs(standing):
+        shift[start:end] = np.median(xy[start:end], axis=0) - xy[start:end]
+        known[start:end] = True
+    if not known.any():
+        return xy.copy()
+    frames = np.arange(len(xy))
+    return xy + np.stack([np.interp(frames, frames[known], shift[known, c]) for c in range(2)], axis=1)
+
+
+def clear(lift: np.ndarray, standing: np.ndarray, *, least: float) -> np.ndarray:
+    """Lift (T,) of one foot with 0 in stance and at least a half sine of `least` (m) in swings between stances."""
+    out = np.where(standing, 0.0, lift)
+    for start, end in runs(~standing):
+        if start > 0 and end < len(lift):
+            arc = np.sin(np.pi * (np.arange(start, end) - start + 1) / (end - start + 1))
+            out[start:end] = np.maximum(out[start:end] * np.sqrt(arc), least * arc)
+    return out
