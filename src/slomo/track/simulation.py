@@ -1,0 +1,180 @@
+"""The whole robot in MuJoCo, from the same URDF that Pinocchio reads.
+
+Pinocchio's conventions outside, MuJoCo's inside: joints in the model's order, quat_xyzw, base velocity in the base
+frame. Links collide with the ground but not with each other.
+"""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import trimesh
+
+from slomo.errors import InvalidData
+from slomo.robot import Robot
+from slomo.terrain import Terrain
+
+Array = np.ndarray
+
+# kg m2, rotor inertia seen at the joint: 1.1e-4 kg m2 (rotor links of the Go1's URDF) behind gears of 6.33 (hip,
+# thigh) and 9.5 (calf) gives 0.0045 to 0.010.
+ARMATURE = 0.01
+GROUND, ROBOT = 1, 2
+
+
+def build_model(robot: Robot, terrain: Terrain, *, friction: float = 0.8, timestep: float = 1e-3) -> mujoco.MjModel:
+    """Free-floating robot on the ground and its boxes, one torque motor a joint in Pinocchio's joint order.
+
+    Args:
+        friction: Coulomb coefficient between any link and the ground.
+        timestep: s.
+
+    Raises:
+        InvalidData: MuJoCo cannot use the URDF.
+    """
+    try:
+        spec = mujoco.MjSpec.from_file(str(robot.urdf))
+        _prepare(spec, robot, friction)
+        _add_ground(spec, terrain, friction)
+        spec.option.timestep = timestep
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+        return spec.compile()
+    except ValueError as e:
+        raise InvalidData(f"MuJoCo cannot use it: {e}", where=robot.urdf) from None
+
+
+def _prepare(spec: mujoco.MjSpec, robot: Robot, friction: float) -> None:
+    """Root, inertia, collision shapes and motors."""
+    spec.compiler.fusestatic = True
+    root = spec.worldbody.first_body()
+    root.add_freejoint(name="root")
+    # The root with all that is fixed to it is Pinocchio's first body, whose inertia `load_robot` has made regular.
+    inertia = robot.model.inertias[1]
+    pending = [root]
+    while pending:
+        body = pending.pop()
+        body.explicitinertial = True
+        body.mass, body.inertia, body.fullinertia = 0.0, [0, 0, 0], [np.nan, 0, 0, 0, 0, 0]
+        pending += [b for b in body.bodies if not b.joints]
+    Y = inertia.inertia
+    root.mass, root.ipos = inertia.mass, inertia.lever
+    root.fullinertia = [Y[0, 0], Y[1, 1], Y[2, 2], Y[0, 1], Y[0, 2], Y[1, 2]]
+
+    for mesh in spec.meshes:
+        hull = trimesh.load(_resolve(mesh.file, robot), force="mesh").convex_hull
+        mesh.file, mesh.uservert = "", np.asarray(hull.vertices, float).ravel()
+    for limb in robot.limbs:
+        foot = spec.body(limb.foot)
+        for geom in list(foot.geoms):
+            spec.delete(geom)
+        foot.add_geom(name=limb.foot, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[limb.foot_radius, 0, 0])
+        foot.add_site(name=limb.foot)
+    for geom in spec.geoms:
+        geom.density = 0  # the links' masses are the URDF's; MuJoCo would add the shapes'
+        geom.contype, geom.conaffinity = ROBOT, GROUND
+        geom.friction[0] = friction
+    for name, effort in zip(robot.joint_names, robot.effort, strict=True):
+        joint = spec.joint(name)
+        joint.armature = ARMATURE
+        motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        motor.ctrllimited, motor.ctrlrange = True, [-effort, effort]
+
+
+def _add_ground(spec: mujoco.MjSpec, terrain: Terrain, friction: float) -> None:
+    common = {"contype": GROUND, "conaffinity": ROBOT, "friction": [friction, 0.005, 1e-4]}
+    spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], **common)
+    for i, b in enumerate(terrain.boxes):
+        spec.worldbody.add_geom(
+            name=f"box{i}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=[(b.x_min + b.x_max) / 2, (b.y_min + b.y_max) / 2, b.height / 2],
+            size=[(b.x_max - b.x_min) / 2, (b.y_max - b.y_min) / 2, b.height / 2],
+            **common,
+        )
+
+
+def _resolve(address: str, robot: Robot) -> Path:
+    """File behind a mesh address of the URDF."""
+    relative = address.removeprefix("package://")
+    for folder in (*robot.package_dirs, robot.urdf.parent):
+        if (folder / relative).is_file():
+            return folder / relative
+    raise InvalidData(f"mesh {address!r} not found", where=robot.urdf, valid=robot.package_dirs)
+
+
+class Simulation:
+    """The robot's state, one `step` at a time.
+
+    Attributes:
+        q: (nq,) and v: (nv,) in Pinocchio's convention.  feet: (C, 3) m, world, foot frames.
+    """
+
+    def __init__(self, robot: Robot, terrain: Terrain, *, friction: float = 0.8, timestep: float = 1e-3):
+        self.robot = robot
+        self.model = build_model(robot, terrain, friction=friction, timestep=timestep)
+        self.data = mujoco.MjData(self.model)
+        ids = [self.model.joint(name).id for name in robot.joint_names]
+        self._qpos, self._qvel = self.model.jnt_qposadr[ids], self.model.jnt_dofadr[ids]
+        self._sites = np.array([self.model.site(name).id for name in robot.foot_names])
+        self._foot_of_geom = np.full(self.model.ngeom, -1)
+        for c, name in enumerate(robot.foot_names):
+            self._foot_of_geom[self.model.geom(name).id] = c
+        self._root_body = int(self.model.jnt_bodyid[self.model.joint("root").id])
+
+    @property
+    def time(self) -> float:
+        """s since `reset`."""
+        return self.data.time
+
+    @property
+    def q(self) -> Array:
+        p = self.data.qpos
+        return np.concatenate([p[:3], p[[4, 5, 6, 3]], p[self._qpos]])
+
+    @property
+    def v(self) -> Array:
+        R = np.empty(9)
+        mujoco.mju_quat2Mat(R, self.data.qpos[3:7])
+        v = self.data.qvel
+        return np.concatenate([R.reshape(3, 3).T @ v[:3], v[3:6], v[self._qvel]])
+
+    @property
+    def feet(self) -> Array:
+        return self.data.site_xpos[self._sites].copy()
+
+    def reset(self, q: Array, v: Array | None = None) -> None:
+        """Start from q (nq,) and v (nv,), at rest without one."""
+        mujoco.mj_resetData(self.model, self.data)
+        p = self.data.qpos
+        p[:3], p[3:7], p[self._qpos] = q[:3], q[[6, 3, 4, 5]], q[7:]
+        if v is not None:
+            R = np.empty(9)
+            mujoco.mju_quat2Mat(R, p[3:7])
+            self.data.qvel[:3], self.data.qvel[3:6] = R.reshape(3, 3) @ v[:3], v[3:6]
+            self.data.qvel[self._qvel] = v[6:]
+        mujoco.mj_forward(self.model, self.data)
+
+    def step(self, tau: Array) -> None:
+        """One time step under joint torques tau (nj,) N m; the motors saturate at their limits."""
+        self.data.ctrl[:] = tau
+        mujoco.mj_step(self.model, self.data)
+        # mj_step leaves positions of the step's start in site_xpos; controllers must see where the feet are now.
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def contacts(self) -> tuple[Array, bool]:
+        """(C, 3) N, world: ground force on each foot in the last step; and whether the body touches the ground."""
+        forces, body_down = np.zeros((len(self._sites), 3)), False
+        wrench = np.empty(6)
+        for i in range(self.data.ncon):
+            contact = self.data.contact[i]
+            first, second = contact.geom  # the force is what the first exerts on the second
+            on_second = self.model.geom_bodyid[first] == 0
+            link = second if on_second else first
+            mujoco.mj_contactForce(self.model, self.data, i, wrench)
+            force = contact.frame.reshape(3, 3).T @ wrench[:3]
+            foot = self._foot_of_geom[link]
+            if foot >= 0:
+                forces[foot] += force if on_second else -force
+            body_down |= int(self.model.geom_bodyid[link]) == self._root_body
+        return forces, body_down
