@@ -189,7 +189,7 @@ def _prepare(source: KeypointMotion, config: Config, report: dict[str, Any], pro
     turning = np.abs(np.gradient(trunk_frame(motion).yaw, 1 / config.rate))
     # What surrounds such a turn is bad too.
     n = round(_MARGIN * config.rate)
-    keep = clean.longest_run(~binary_dilation(turning > config.max_turn_rate, iterations=n))
+    keep = clean.longest_run(np.logical_not(binary_dilation(turning > config.max_turn_rate, iterations=n)))
     if keep.stop - keep.start < 0.5 * config.rate:
         raise InvalidData(
             f"no half second without turns faster than {config.max_turn_rate} rad/s", where="key points",
