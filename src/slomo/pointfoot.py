@@ -1,0 +1,116 @@
+"""The point-foot model: one rigid body and C point masses that touch the ground.
+
+    m  dv_b = sum_c u_c + m g                     body (base frame origin = its centre of mass), world frame
+    I  dw   = R^T sum_c (f_c - p) x u_c - w x I w   body frame
+    m_c df_c'' = -u_c + m_c g + lam_c               each contact point, world frame
+
+`u_c` is the force that point c exerts on the body (through its leg), `lam_c` the force of the ground on it. A
+quadruped has 18 degrees of freedom and 12 inputs. q, v, u and lam are laid out as in `motion.Reference`.
+"""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import pinocchio as pin  # pyright: ignore[reportMissingImports]
+
+from slomo.errors import InvalidData
+from slomo.robot import Robot
+
+Array = np.ndarray
+GRAVITY = 9.81  # m/s^2
+
+
+@dataclass(frozen=True)
+class PointFootModel:
+    """Constants of the model.
+
+    Attributes:
+        mass: kg, of the body: the robot without its feet.
+        inertia: (3, 3) kg m^2, of the body about its origin, body frame.
+        hips: (C, 3) m, attachment of each leg in the body frame.
+        leg_min, leg_max: (C,) m, limits of the distance from hip to foot.
+        foot_mass: (C,) kg.
+        u_max: (C, 3) N, largest |u| along each world axis.
+        mu: friction coefficient.  g: m/s^2.
+        names: C limb names.
+    """
+
+    mass: float
+    inertia: Array
+    hips: Array
+    leg_min: Array
+    leg_max: Array
+    foot_mass: Array
+    u_max: Array
+    names: tuple[str, ...]
+    mu: float = 0.6
+    g: float = GRAVITY
+
+    def __post_init__(self):
+        C = len(self.names)
+        for name, shape in dict(
+            inertia=(3, 3), hips=(C, 3), leg_min=(C,), leg_max=(C,), foot_mass=(C,), u_max=(C, 3)
+        ).items():
+            x = np.asarray(getattr(self, name), float)
+            if x.shape != shape or not np.all(np.isfinite(x)):
+                raise InvalidData(f"needs finite numbers of shape {shape}, got shape {x.shape}", where=f"model {name}")
+            object.__setattr__(self, name, np.ascontiguousarray(x))
+        if not np.allclose(self.inertia, self.inertia.T) or np.linalg.eigvalsh(self.inertia)[0] <= 0:
+            raise InvalidData("needs a symmetric positive definite matrix", where="model inertia")
+        if not (self.mass > 0 and self.mu > 0 and np.all(self.foot_mass > 0) and np.all(self.u_max > 0)):
+            raise InvalidData("mass, foot_mass, u_max and mu need positive numbers", where="model")
+        if not np.all((self.leg_min >= 0) & (self.leg_min < self.leg_max)):
+            raise InvalidData("needs 0 <= leg_min < leg_max", where="model legs")
+
+    @property
+    def C(self) -> int:
+        """Number of contact points."""
+        return len(self.names)
+
+    @property
+    def total_mass(self) -> float:
+        """kg, body and feet."""
+        return float(self.mass + self.foot_mass.sum())
+
+    @classmethod
+    def from_robot(cls, robot: Robot, *, mu: float = 0.6) -> Self:
+        """The model of a robot. `mu` is the friction coefficient to plan with.
+
+        Body mass is that of the robot without its feet; body inertia that of all links above the last joint of each
+        leg at the nominal pose; leg lengths are the joints' reach, tightened because near a straight or a folded leg
+        the hip frame's own motion counts; `u_max` is what the joint torques allow along one axis at the nominal pose.
+
+        Raises:
+            InvalidData: the robot's [point_foot] lacks `foot_mass`.
+        """
+        if not float(robot.point_foot.get("foot_mass", 0)) > 0:
+            raise InvalidData("[point_foot] needs foot_mass in kg, above 0", where=f"robot {robot.name}")
+        C = len(robot.limbs)
+        foot_mass = np.full(C, float(robot.point_foot["foot_mass"]))
+        model, data = robot.model, robot.model.createData()
+        pin.computeJointJacobians(model, data, robot.q_nominal)
+        pin.updateFramePlacements(model, data)
+        T_world_base = data.oMf[model.getFrameId(robot.base)]
+        feet = [model.getFrameId(name) for name in robot.foot_names]
+        shanks = {model.frames[f].parentJoint for f in feet}
+        body = pin.Inertia.Zero()
+        for j in range(1, model.njoints):
+            if j not in shanks:
+                body += (T_world_base.inverse() * data.oMi[j]).act(model.inertias[j])
+        lever = pin.skew(body.lever)
+        u_max = np.empty((C, 3))
+        for c, f in enumerate(feet):
+            J = pin.getFrameJacobian(model, data, f, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)[:3, 6:]
+            u_max[c] = np.min(robot.effort / np.maximum(np.abs(J), 1e-6), axis=1)
+        return cls(
+            mass=robot.mass - float(foot_mass.sum()),
+            inertia=body.inertia - body.mass * lever @ lever,
+            hips=robot.nominal_hips,
+            leg_min=1.1 * robot.leg_reach[:, 0],
+            leg_max=0.97 * robot.leg_reach[:, 1],
+            foot_mass=foot_mass,
+            u_max=u_max,
+            names=robot.limb_names,
+            mu=mu,
+        )
