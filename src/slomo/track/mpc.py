@@ -1,0 +1,255 @@
+"""Contact-implicit model-predictive control: the optimiser's compiled DDP over a short horizon, at every tick.
+
+From the measured state, H knots ahead, one or two Gauss-Newton steps from the last plan (a real-time iteration; Diehl,
+Bock, Schloeder 2005). Nothing is scheduled: which foot stands when follows from the cost and the contact model.
+"""
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit
+
+from slomo.motion import Reference
+from slomo.optimize import ddp, so3
+from slomo.optimize.cost import Task
+from slomo.optimize.dynamics import Body, minus
+from slomo.pointfoot import PointFootModel
+from slomo.terrain import Terrain
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True)
+class MpcConfig:
+    """Parameters of the controller; weights as in `optimize.problem.Weights`.
+
+    Attributes:
+        horizon: number of steps.  dt: s, their length.  iterations: Newton steps a tick.
+        mu: friction coefficient to plan with.  kappa: N m, smoothing of the contact.
+        effort: 1/N^2, weight of the deviation from the reference's forces.
+        terminal: s, weight of the end state (as if it lasted that long).
+    """
+
+    horizon: int = 10
+    dt: float = 0.05
+    iterations: int = 2
+    mu: float = 0.6
+    kappa: float = 1e-3
+    position: float = 1000.0
+    orientation: float = 300.0
+    foot: float = 300.0
+    foot_height: float = 500.0
+    velocity: float = 10.0
+    angular_velocity: float = 2.0
+    foot_velocity: float = 0.5
+    effort: float = 2e-4
+    acceleration: float = 0.0
+    slip: float = 300.0
+    slip_load: float = 2.0
+    terminal: float = 0.1
+
+
+@njit(cache=True)
+def _sample(t0, dt, qs, vs, us, t, q, v, u):
+    """State (linear, rotations along the geodesic) at t of knots t0 + k dt, velocity and input of the step that t is in.
+
+    Before the first and after the last knot the motion stands still at that knot, with the input of the nearest step.
+    """
+    N = us.shape[0]
+    s = (t - t0) / dt
+    k = int(np.floor(s + 1e-9))
+    if s <= -1e-9 or k >= N:
+        n = 0 if k < N else N
+        q[:], v[:] = qs[n], 0.0
+        u[:] = us[min(n, N - 1)]
+        return
+    a = min(max(s - k, 0.0), 1.0)
+    w = np.empty(3)
+    so3.minus(qs[k + 1, 3:7], qs[k, 3:7], w)
+    so3.plus(qs[k, 3:7], a * w[0], a * w[1], a * w[2], q[3:7])
+    for i in range(qs.shape[1]):
+        if i < 3 or i >= 7:
+            q[i] = (1 - a) * qs[k, i] + a * qs[k + 1, i]
+    v[:], u[:] = vs[k + 1], us[k]
+
+
+@njit(cache=True)
+def _sample_all(t0, dt, qs, vs, us, t, h, q_out, v_out, u_out):
+    """`_sample` at knots t + k h; velocities are those of the step that ends at the knot, as in the integrator."""
+    u = np.empty(us.shape[1])
+    for k in range(q_out.shape[0]):
+        _sample(t0, dt, qs, vs, us, t + (k - 0.5) * h, q_out[k], v_out[k], u)
+        if k > 0:
+            u_out[k - 1] = u
+        _sample(t0, dt, qs, vs, us, t + k * h, q_out[k], np.empty(vs.shape[1]), u)
+
+
+@dataclass(frozen=True)
+class PlanPoint:
+    """The plan at one time, world frame: position (3,) m, quat_xyzw (4,), velocity (3,) m/s, angular_velocity (3,) rad/s in
+    the body frame, points and point_velocities (C, 3), u (C, 3) N force of each point on the body, lam (C, 3) N contact force."""
+
+    position: Array
+    quat_xyzw: Array
+    velocity: Array
+    angular_velocity: Array
+    points: Array
+    point_velocities: Array
+    u: Array
+    lam: Array
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the controller intends from time `t` on.
+
+    Attributes:
+        t: s, when the state was measured.  dt: s.
+        q (H + 1, 7 + 3 C), v (H + 1, 6 + 3 C), u (H, 3 C), lam (H, C, 3): as in `motion.Reference`.
+        gains: (H, 3 C, 12 + 6 C), Riccati feedback of u on the tangent-space deviation from q, v.
+        status: 0 solved, 1 the solver failed and the previous plan goes on.
+        defect: l1 norm of what the dynamics lack over the horizon.
+        seconds: wall time of the solve.
+    """
+
+    t: float
+    dt: float
+    q: Array
+    v: Array
+    u: Array
+    lam: Array
+    gains: Array
+    u_max: Array
+    status: int
+    defect: float
+    seconds: float
+
+    def at(self, t: float) -> PlanPoint:
+        """The plan at time t (s), between its knots; before or after them it stands still."""
+        q, v, u = np.empty(self.q.shape[1]), np.empty(self.v.shape[1]), np.empty(self.u.shape[1])
+        _sample(self.t, self.dt, self.q, self.v, self.u, t, q, v, u)
+        return PlanPoint(
+            position=q[:3],
+            quat_xyzw=q[3:7],
+            velocity=v[:3],
+            angular_velocity=v[3:6],
+            points=q[7:].reshape(-1, 3),
+            point_velocities=v[6:].reshape(-1, 3),
+            u=u.reshape(-1, 3),
+            lam=self.lam[self._step(t)],
+        )
+
+    def feedback(self, t: float, q: Array, v: Array) -> Array:
+        """(C, 3) N: the forces for the state that is there at time t, by the Riccati gains, within the limits."""
+        qp, vp, u = np.empty(self.q.shape[1]), np.empty(self.v.shape[1]), np.empty(self.u.shape[1])
+        _sample(self.t, self.dt, self.q, self.v, self.u, t, qp, vp, u)
+        k = self._step(t)
+        a = min(max((t - self.t) / self.dt - k, 0.0), 1.0)
+        d = np.empty(2 * len(v))
+        minus(q, v, qp, (1 - a) * self.v[k] + a * self.v[k + 1], d)
+        return np.clip(u + self.gains[k] @ d, -self.u_max, self.u_max).reshape(-1, 3)
+
+    def _step(self, t: float) -> int:
+        return min(max(int((t - self.t) / self.dt + 1e-9), 0), len(self.u) - 1)
+
+
+class Mpc:
+    """Tracks a reference with the point-foot model.
+
+    Args:
+        model: of the robot; its `mu` is replaced by the config's.
+        reference: what to track, in the world in which `terrain` is.
+        terrain: ground under the points.
+    """
+
+    def __init__(
+        self, model: PointFootModel, reference: Reference, *, terrain: Terrain, config: MpcConfig | None = None
+    ):
+        self.config = c = config or MpcConfig()
+        self.model = replace(model, mu=c.mu)
+        self.terrain = terrain
+        self.reference = reference
+        H, C = c.horizon, model.C
+        nv = 6 + 3 * C
+        self._body = Body.of(self.model)
+        self._work = ddp.Work.make(H, C)
+        w = np.empty((H + 1, 2 * nv))
+        w[:, :3], w[:, 3:6] = c.position, c.orientation
+        w[:, 6:nv] = np.tile([c.foot, c.foot, c.foot_height], C)
+        w[:, nv : nv + 3], w[:, nv + 3 : nv + 6], w[:, nv + 6 :] = c.velocity, c.angular_velocity, c.foot_velocity
+        h = np.full(H + 1, c.dt)
+        h[-1] = c.terminal
+        self._task = Task(
+            h=h, heights=np.zeros((H + 1, C)), q_ref=np.zeros((H + 1, nv + 1)), v_ref=np.zeros((H + 1, nv)),
+            u_ref=np.zeros((H, 3 * C)), w_x=w, w_u=np.full((H, 3 * C), c.effort),
+            w_acceleration=c.acceleration, w_slip=c.slip, slip_load=c.slip_load,
+        )  # fmt: skip
+        r = reference
+        self._dt_ref = float(np.mean(r.h))
+        if not np.allclose(r.h, self._dt_ref, rtol=1e-6):
+            raise ValueError("the reference needs steps of one length")
+        self._ref = (float(r.t[0]), self._dt_ref, *(np.ascontiguousarray(x, float) for x in (r.q, r.v, r.u)))
+        self._hold = self._standing_forces()
+        self._plan: Plan | None = None
+        self._reg = 1e-6
+
+    def _standing_forces(self) -> Array:
+        """(3 C,) N: the weight split over the points that stand in the reference's last state."""
+        gap = self.reference.points[-1, :, 2] - self.terrain.height(self.reference.points[-1])
+        near = np.exp(-np.maximum(gap, 0) / 0.01) + 1e-3
+        u = np.zeros((self.model.C, 3))
+        u[:, 2] = self.model.mass * self.model.g * near / near.sum()
+        return u.ravel()
+
+    def reset(self) -> None:
+        """Forget the last plan; the next step starts from the reference."""
+        self._plan = None
+        self._reg = 1e-6
+
+    def warm_up(self) -> float:
+        """Compile or load everything that `step` calls, so that no tick pays for it; returns the seconds."""
+        start = time.perf_counter()
+        for _ in range(2):
+            plan = self.step(float(self.reference.t[0]), self.reference.q[0], self.reference.v[0])
+            plan.feedback(plan.t, plan.q[0], plan.v[0])
+        self.reset()
+        return time.perf_counter() - start
+
+    def step(self, t: float, q: Array, v: Array) -> Plan:
+        """Plan from the measured state.
+
+        Args:
+            t: s, on the reference's clock.  q: (7 + 3 C,), v: (6 + 3 C,) as in `motion.Reference`.
+        """
+        start = time.perf_counter()
+        c, task = self.config, self._task
+        H, C = c.horizon, self.model.C
+        _sample_all(*self._ref, t, c.dt, task.q_ref, task.v_ref, task.u_ref)
+        task.u_ref[t + (np.arange(H) + 0.5) * c.dt > self.reference.t[-1]] = self._hold
+        last = self._plan
+        it = ddp.Iterate(
+            task.q_ref.copy(), task.v_ref.copy(), task.u_ref.copy(), np.zeros((H, C, 3)), np.zeros((H + 1, C, 2))
+        )
+        if last is not None:
+            # The last plan as far as it reaches; what follows stays at the reference.
+            n = min(max(H + 1 - round((t - last.t) / c.dt + 0.5), 0), H)
+            if n > 0:
+                _sample_all(last.t, c.dt, last.q, last.v, last.u, t, c.dt, it.qs[: n + 1], it.vs[: n + 1], it.us[:n])
+        it.qs[0], it.vs[0] = q, v
+        task.heights[:] = self.terrain.height(it.qs[:, 7:].reshape(H + 1, C, 3))
+        status, _, _, defect, self._reg = ddp.solve(
+            self._body, task, c.kappa, it, 1e4, False, c.iterations, 1e-9, self._reg, self._work
+        )
+        failed = status in (ddp.STUCK, ddp.NOT_FINITE)
+        if failed:
+            self._reg = 1e-6
+        if failed and last is not None:
+            plan = replace(last, status=1, seconds=time.perf_counter() - start)
+        else:
+            plan = Plan(
+                t=t, dt=c.dt, q=it.qs, v=it.vs, u=it.us, lam=it.lam, gains=self._work.K.copy(), u_max=self._body.u_max,
+                status=int(failed), defect=float(defect), seconds=time.perf_counter() - start,
+            )  # fmt: skip
+        self._plan = plan
+        return plan
