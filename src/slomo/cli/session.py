@@ -1,0 +1,202 @@
+"""What all commands share: their common options, the project, results on stdout, errors and exit codes."""
+
+import contextlib
+import inspect
+import os
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from slomo.console import Console
+from slomo.errors import InvalidData, SlomoError, StageFailed
+
+if TYPE_CHECKING:
+    from slomo.pipeline import Project
+    from slomo.runner import Runner
+    from slomo.store import Manifest
+
+COMMON: dict[str, Any] = {
+    "project": Annotated[
+        Path | None,
+        typer.Option("--project", help="Project folder. Default: the nearest parent with slomo.toml, else this one."),
+    ],
+    "as_json": Annotated[bool, typer.Option("--json", help="Print a JSON object instead of a path or text.")],
+    "quiet": Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no notes; errors only.")],
+}
+RUNNING: dict[str, Any] = {
+    "no_wait": Annotated[
+        bool, typer.Option("--no-wait", help="Exit with 75 if another process makes the same artifact.")
+    ],
+    "fresh": Annotated[bool, typer.Option("--fresh", help="Make it anew: neither cache nor checkpoint.")],
+    "overrides": Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="SECTION.NAME=VALUE", help="Write a parameter into slomo.toml. Repeatable."),
+    ],
+}
+RobotOption = Annotated[
+    str, typer.Option("--robot", metavar="NAME|PATH", help="A name of `slomo robots`, or the path of a robot.toml.")
+]
+
+
+@dataclass
+class Session:
+    """One command under way."""
+
+    project_option: Path | None = None
+    as_json: bool = False
+    quiet: bool = False
+    no_wait: bool = False
+    fresh: bool = False
+    overrides: list[str] = field(default_factory=list)
+
+    def __post_init__(self):
+        self.console = Console(quiet=self.quiet)
+
+    @property
+    def root(self) -> Path:
+        """The project folder, which need not exist yet."""
+        if self.project_option is not None:
+            return self.project_option.absolute()
+        here = Path.cwd()
+        return next((p for p in (here, *here.parents) if (p / "slomo.toml").is_file()), here)
+
+    def project(self, robot: str | None = None) -> "Project":
+        """The project as it is, with the --set options written to its slomo.toml."""
+        return self.configure({}, robot)
+
+    def configure(self, changes: dict[str, dict[str, Any]], robot: str | None = None) -> "Project":
+        """The project with `changes` and the --set options checked and written to its slomo.toml."""
+        from slomo import settings
+        from slomo.pipeline import STAGES, Project
+
+        changes = {section: dict(values) for section, values in changes.items() if values}
+        for text in self.overrides:
+            section, name, value = settings.parse_set(text)
+            changes.setdefault(section, {})[name] = value
+        project = Project(self.root, robot)
+        project.tables = settings.merge(project.tables, changes, list(STAGES), where=self.root / settings.FILE)
+        for section in changes.keys() - {"inputs"}:
+            project.config(section)
+        if changes:
+            self.initialise()
+            for line in settings.edit(self.root, changes):
+                self.console.note(line)
+        return project
+
+    def initialise(self) -> bool:
+        """Write slomo.toml unless there is one; say so. True if it was written."""
+        from slomo import settings
+        from slomo.pipeline import template
+        from slomo.store import replace_file
+
+        path = self.root / settings.FILE
+        if path.is_file():
+            return False
+        replace_file(path, template().encode())
+        self.console.note(f"new project: {path}")
+        return True
+
+    def user_path(self, path: Path, what: str) -> str:
+        """A user's file as slomo.toml names it: relative inside the project, absolute elsewhere."""
+        if not path.exists():
+            raise InvalidData("no such file or folder", where=path, todo=f"give an existing path ({what})")
+        resolved, root = path.resolve(), self.root.resolve()
+        return resolved.relative_to(root).as_posix() if resolved.is_relative_to(root) else str(resolved)
+
+    def runner(self, project: "Project") -> "Runner":
+        """What makes the project's artifacts."""
+        from slomo.runner import Runner
+
+        return Runner(project, self.console, wait=not self.no_wait, fresh=self.fresh)
+
+    def emit(self, text: str, data: Any) -> None:
+        """Print the command's result on stdout."""
+        from slomo.store import json_bytes
+
+        self.console.close()
+        print(json_bytes(data).decode().rstrip("\n") if self.as_json else text, flush=True)
+
+    def emit_artifact(self, m: "Manifest") -> None:
+        """Print an artifact's path or manifest. Raises `StageFailed` if its result is not usable."""
+        path = self.root / m["directory"]
+        self.emit(str(path), m)
+        if m["failure"]:
+            raise StageFailed(m["failure"], where=m["stage"], todo=f"its best result is in {path}")
+
+
+def _crashed(session: Session, error: Exception) -> str:
+    """Keep the traceback where the user can find it; one line."""
+    text = f"{' '.join(sys.argv)}\n\n{''.join(traceback.format_exception(error))}"
+    places = [session.root / ".slomo", Path(tempfile.gettempdir())]
+    for folder in places:
+        with contextlib.suppress(OSError):
+            if folder is places[0] and (session.root / "slomo.toml").is_file():
+                folder.mkdir(exist_ok=True)
+            (folder / "crash.txt").write_text(text)
+            shown = ".slomo/crash.txt" if folder is places[0] else folder / "crash.txt"
+            return f"internal error: {type(error).__name__}: {error} (traceback in {shown})"
+    return f"internal error: {type(error).__name__}: {error}"
+
+
+def _exit_code(session: Session, run: Callable[[], None]) -> int:
+    """Run a command; every way in which it can end, as an exit code and at most one line on stderr."""
+    try:
+        run()
+        return 0
+    except SlomoError as e:
+        line, code = str(e), e.exit_code
+    except KeyboardInterrupt:
+        line, code = "interrupted", 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return 1
+    except MemoryError:
+        line, code = "out of memory; use a shorter or smaller clip (--duration)", 1
+    except (typer.Exit, typer.Abort):
+        raise
+    except Exception as e:
+        line, code = _crashed(session, e), 1
+    session.console.close()
+    session.console.line(f"slomo: {' '.join(line.split())}")
+    return code
+
+
+def command(app: typer.Typer, name: str, *, runs: bool = False) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Register `f(session, ...)` as a command with the common options and the error handling of all commands.
+
+    Args:
+        runs: whether it makes artifacts, and so takes --no-wait, --fresh and --set too.
+    """
+    extra = COMMON | (RUNNING if runs else {})
+    defaults = {"project": None, "overrides": None}
+
+    def register(f: Callable[..., None]) -> Callable[..., None]:
+        def wrapper(**given: Any) -> None:
+            mine = {n: given.pop(n) for n in extra}
+            mine["project_option"] = mine.pop("project")
+            if "overrides" in mine:
+                mine["overrides"] = mine["overrides"] or []
+            session = Session(**mine)
+            code = _exit_code(session, lambda: f(session, **given))
+            session.console.close()
+            raise typer.Exit(code)
+
+        own = list(inspect.signature(f, eval_str=True).parameters.values())[1:]
+        added = [
+            inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, annotation=a, default=defaults.get(n, False))
+            for n, a in extra.items()
+        ]
+        own = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own]
+        wrapper.__signature__ = inspect.Signature([*own, *added])  # type: ignore[attr-defined]
+        wrapper.__annotations__ = {p.name: p.annotation for p in (*own, *added)}
+        wrapper.__doc__ = f.__doc__
+        app.command(name)(wrapper)
+        return f
+
+    return register

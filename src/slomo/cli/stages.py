@@ -1,0 +1,174 @@
+"""The commands that make artifacts."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from slomo.cli.session import RobotOption, Session, command
+from slomo.errors import MissingInput, UsageError
+
+KEYPOINT_SUFFIXES = (".json", ".npz")
+BUILT_IN_SKELETONS = ("quadruped", "human")
+
+
+def _given(**values: Any) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _skeleton(session: Session, skeleton: str | None) -> dict[str, dict[str, Any]]:
+    """A built-in name is a parameter of the fit, a path one of the user's files; the one unsets the other."""
+    if skeleton is None:
+        return {}
+    if skeleton in BUILT_IN_SKELETONS:
+        return {"reconstruct": {"skeleton": skeleton}, "inputs": {"skeleton": None}}
+    if not Path(skeleton).is_file():
+        raise UsageError(
+            f"no skeleton {skeleton!r}", where="--skeleton", valid=BUILT_IN_SKELETONS, todo="or give a .toml file"
+        )
+    return {"inputs": {"skeleton": session.user_path(Path(skeleton), "skeleton")}}
+
+
+def add_commands(app: typer.Typer) -> None:
+    """Register the commands with `app`."""
+
+    @command(app, "reconstruct", runs=True)
+    def reconstruct(
+        session: Session,
+        clip: Annotated[Path | None, typer.Argument(help="Video file. Default: the one of the last call.")] = None,
+        skeleton: Annotated[
+            str | None, typer.Option("--skeleton", metavar="quadruped|human|PATH", help="Whose bones to fit.")
+        ] = None,
+        segmenter: Annotated[
+            str | None, typer.Option("--segmenter", metavar="auto|u2netp|motion", help="How the subject is found.")
+        ] = None,
+        masks: Annotated[
+            Path | None, typer.Option("--masks", metavar="DIR", help="Your own masks, one image a frame.")
+        ] = None,
+        weights: Annotated[Path | None, typer.Option("--weights", help="U2-Net-p weights (.onnx).")] = None,
+        start: Annotated[float | None, typer.Option("--start", help="First second of the clip to use.")] = None,
+        duration: Annotated[float | None, typer.Option("--duration", help="Seconds to use; 0: all.")] = None,
+        length: Annotated[
+            float | None, typer.Option("--length", help="Body length in metres (the clip alone cannot tell it).")
+        ] = None,
+        fov: Annotated[float | None, typer.Option("--fov", help="Horizontal field of view in degrees.")] = None,
+    ) -> None:
+        """Key points in metres from a clip: decode, masks, camera, skeleton fit.
+
+        Options given here are written into slomo.toml, and hold until they are changed there or given anew.
+
+        \b
+        slomo reconstruct cat.mp4
+        slomo reconstruct cat.mp4 --duration 4 --length 0.45
+        slomo reconstruct man.mp4 --skeleton human
+        """
+        files = {"clip": clip, "masks": masks, "weights": weights}
+        inputs = {role: session.user_path(path, role) for role, path in files.items() if path is not None}
+        changes = _skeleton(session, skeleton)
+        changes["inputs"] = changes.get("inputs", {}) | inputs
+        changes["decode"] = _given(start=start, duration=duration)
+        changes["masks"] = _given(segmenter=segmenter)
+        changes["camera"] = _given(fov=fov)
+        changes["reconstruct"] = changes.get("reconstruct", {}) | _given(length=length)
+        project = session.configure(changes)
+        session.emit_artifact(session.runner(project).make("reconstruct"))
+
+    @command(app, "import", runs=True)
+    def import_(
+        session: Session,
+        file: Annotated[Path, typer.Argument(help="keypoints.npz, or a key-point JSON of SLoMo's authors.")],
+    ) -> None:
+        """Key points from a file, instead of from a clip.
+
+        \b
+        slomo import cat00.json
+        """
+        project = session.configure({"inputs": {"keypoints": session.user_path(file, "keypoints")}})
+        session.emit_artifact(session.runner(project).make("import"))
+
+    @command(app, "retarget", runs=True)
+    def retarget(
+        session: Session,
+        robot: RobotOption,
+        source: Annotated[
+            str | None,
+            typer.Option(
+                "--from", metavar="reconstruct|import|FILE", help="Where the key points come from, if in doubt."
+            ),
+        ] = None,
+    ) -> None:
+        """The motion in the robot's size: its base, hips and feet.
+
+        \b
+        slomo retarget --robot go1
+        slomo retarget --robot go1 --from dog_cpr.json
+        """
+        changes: dict[str, Any] = {}
+        if source in ("reconstruct", "import"):
+            changes["motion"] = source
+        elif source is not None:
+            changes = {"keypoints": session.user_path(Path(source), "keypoints"), "motion": "import"}
+        project = session.configure({"inputs": changes}, robot)
+        runner = session.runner(project)
+        session.emit_artifact(runner.make("retarget") if "keypoints" in changes else runner.make_only("retarget"))
+
+    @command(app, "optimize", runs=True)
+    def optimize(session: Session, robot: RobotOption) -> None:
+        """A reference that satisfies dynamics and contact: states, forces, inputs.
+
+        \b
+        slomo optimize --robot go1
+        slomo optimize --robot go1 --set optimize.mu=0.5
+        """
+        session.emit_artifact(session.runner(session.project(robot)).make_only("optimize"))
+
+    @command(app, "track", runs=True)
+    def track(
+        session: Session,
+        robot: RobotOption,
+        sim: Annotated[bool, typer.Option("--sim", help="In simulation (MuJoCo).")] = False,
+        no_video: Annotated[bool, typer.Option("--no-video", help="Leave out the report with its video.")] = False,
+    ) -> None:
+        """The robot follows the reference; then the report with the side-by-side video.
+
+        \b
+        slomo track --sim --robot go1
+        """
+        if not sim:
+            raise UsageError("where is the robot?", where="track", valid=("--sim",))
+        runner = session.runner(session.project(robot))
+        session.emit_artifact(runner.make_only("track", show=not no_video))
+
+    @command(app, "report", runs=True)
+    def report(session: Session, robot: RobotOption) -> None:
+        """Side-by-side video, plots and tables of what is there.
+
+        \b
+        slomo report --robot go1
+        """
+        session.emit_artifact(session.runner(session.project(robot)).make_only("report"))
+
+    @command(app, "run", runs=True)
+    def run(
+        session: Session,
+        robot: RobotOption,
+        source: Annotated[
+            Path | None, typer.Argument(metavar="[CLIP|KEYPOINTS]", help="Default: that of the last call.")
+        ] = None,
+        no_video: Annotated[bool, typer.Option("--no-video", help="Leave out the report with its video.")] = False,
+    ) -> None:
+        """Everything, from the clip (or key points) to the robot and the report. What is current is kept.
+
+        \b
+        slomo run cat.mp4 --robot go1
+        slomo run cat00.json --robot go1
+        """
+        changes: dict[str, Any] = {}
+        if source is not None:
+            role = "keypoints" if source.suffix in KEYPOINT_SUFFIXES else "clip"
+            changes = {role: session.user_path(source, role)}
+            changes["motion"] = "import" if role == "keypoints" else "reconstruct"
+        project = session.configure({"inputs": changes}, robot)
+        if source is None and not (session.root / "slomo.toml").is_file():
+            raise MissingInput("no project and no clip", where=session.root, todo="run `slomo run CLIP --robot NAME`")
+        session.emit_artifact(session.runner(project).make("track" if no_video else "report"))
