@@ -273,4 +273,3 @@ def close(body, task, kappa, it, w):
             it.us[k, i] = min(max(s, -body.u_max[i]), body.u_max[i])
         step(body, task.h[k], kappa, task.heights[k + 1], it.qs[k], it.vs[k], it.us[k], q, v, it.lam[k])
     it.qs[N], it.vs[N] = q, v
-

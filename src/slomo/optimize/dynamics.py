@@ -149,7 +149,9 @@ def linearize(body, h, kappa, height, q, v, u, q1, v1, lam, A, B, D):
         # d(-w x I w)/dw = [I w]x - [w]x I
         for k in range(3):
             A[r + i, r + k] = -(
-                a * (w1 * I[2, k] - w2 * I[1, k]) + b * (w2 * I[0, k] - w0 * I[2, k]) + d * (w0 * I[1, k] - w1 * I[0, k])
+                a * (w1 * I[2, k] - w2 * I[1, k])
+                + b * (w2 * I[0, k] - w0 * I[2, k])
+                + d * (w0 * I[1, k] - w1 * I[0, k])
             )
         A[r + i, r] += b * L[2] - d * L[1]
         A[r + i, r + 1] += d * L[0] - a * L[2]
