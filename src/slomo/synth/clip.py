@@ -1,0 +1,147 @@
+"""Render a clip of the procedural animal, with its truth: `clip.mp4`, `truth.npz` and `masks.npz`."""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slomo.errors import UsageError
+from slomo.formats.mp4 import encode_mp4
+from slomo.raycast import Part, Scene
+from slomo.stage import Progress
+from slomo.synth.animal import ANIMALS, BONES, FEET, KEYPOINTS, build_body, proportions
+from slomo.synth.gait import GAITS, animate
+from slomo.synth.scene import ANIMAL, CAMERAS, camera, light, surroundings
+
+
+@dataclass(frozen=True)
+class Config:
+    """What is rendered; the same config and seed give the same truth.
+
+    Attributes:
+        animal: "dog", "cat" or "horse"; its proportions and coat vary with the seed.
+        gait: "walk", "pace", "trot" or "stand".  speed: m/s; 0 = the usual speed of the gait.  turn: degrees/s, positive to the left.
+        camera: "follow", "orbit", "pan" or "static".  view: degrees, 0 = the left flank, 90 = from the front.
+        shake: camera shake, 1 = a hand.  clutter: posts near the animal.
+        seconds, fps, width, height: of the clip (px).
+        noise: standard deviation of the sensor noise, of 255.  crf: H.264 quality, lower is better.
+        seed: of the animal, its small motions, the place and the hand.
+    """
+
+    animal: str = "dog"
+    gait: str = "walk"
+    speed: float = 0.0
+    turn: float = 0.0
+    camera: str = "follow"
+    view: float = 15.0
+    shake: float = 1.0
+    clutter: bool = False
+    seconds: float = 3.0
+    fps: float = 30.0
+    width: int = 480
+    height: int = 270
+    noise: float = 2.0
+    crf: int = 22
+    seed: int = 0
+
+    def __post_init__(self):
+        for name, known in (("animal", ANIMALS), ("gait", tuple(GAITS)), ("camera", CAMERAS)):
+            if getattr(self, name) not in known:
+                raise UsageError(f"no {name} {getattr(self, name)!r}", where="synth", valid=known)
+        for name, low, high in (("seconds", 0.2, 120), ("fps", 5, 240), ("width", 64, 3840), ("height", 64, 2160)):
+            if not low <= getattr(self, name) <= high:
+                raise UsageError(f"{name} is {getattr(self, name)}", where="synth", valid=[f"{low} to {high}"])
+        if self.width % 2 or self.height % 2:
+            raise UsageError(f"H.264 needs an even width and height, not {self.width}x{self.height}", where="synth")
+
+
+# The clip that comes with slomo (assets/walk), and the truth beside it.
+EMBEDDED = Config(width=640, height=360, crf=26)
+
+
+def _motion(config: Config):
+    p = proportions(config.animal, config.seed)
+    t = np.arange(round(config.seconds * config.fps)) / config.fps
+    try:
+        speed = config.speed or None
+        motion = animate(p, config.gait, t, speed=speed, turn=np.radians(config.turn), seed=config.seed)
+    except ValueError as e:
+        raise UsageError(str(e), where="synth", todo="give a lower --speed or another --gait") from None
+    k = motion.keypoints
+    length = float(np.linalg.norm(k[:, KEYPOINTS.index("nose")] - k[:, KEYPOINTS.index("tail_tip")], axis=1).mean())
+    target = (k[:, KEYPOINTS.index("nose")] + k[:, KEYPOINTS.index("tail_tip")]) / 2
+    target[:, 2] = 0.55 * p.height
+    view, size = np.radians(config.view), (config.width, config.height)
+    cam = camera(config.camera, target, t, length=length, view=view, size=size, shake=config.shake, seed=config.seed)
+    return p, motion, target, *cam
+
+
+def truth(config: Config) -> dict[str, np.ndarray]:
+    """The arrays of `truth.npz`, without rendering anything.
+
+    `keypoints` (T, N, 3) m, world, z up, ground at 0, joint centres named `keypoint_names`; `T_world_cam` (T, 4, 4) in the OpenCV
+    convention; `K` (3, 3) px; `foot_contact` (T, 4) for `foot_names`; `body_length` m (withers to tail base); `contact_height` (m) and
+    `contact_speed` (m/s) as thresholds for a contact detector; `bones` as "a-b"; `config` as JSON.
+    """
+    p, motion, _, K, T_world_cam = _motion(config)
+    k = motion.keypoints
+    a, b = KEYPOINTS.index("withers"), KEYPOINTS.index("tail_base")
+    body_length = float(np.linalg.norm(k[:, a] - k[:, b], axis=1).mean())
+    return dict(
+        fps=np.float64(config.fps),
+        K=K,
+        T_world_cam=T_world_cam,
+        keypoints=k,
+        keypoint_names=np.array(KEYPOINTS),
+        foot_contact=motion.contact,
+        foot_names=np.array([f"{f}_paw" for f in FEET]),
+        kind=np.array("quadruped"),
+        body_length=np.float64(body_length),
+        contact_height=np.float64(0.055 * body_length),
+        contact_speed=np.float64(0.7 * body_length),
+        image_size=np.array([config.width, config.height]),
+        bones=np.array([f"{x}-{y}" for x, y in BONES]),
+        gravity=np.array([0.0, 0, -1]),
+        config=np.array(json.dumps(asdict(config))),
+    )
+
+
+def render(config: Config, progress: Progress):
+    """Yield (rgb (H, W, 3) uint8 with sensor noise, mask (H, W) bool) frame by frame."""
+    p, motion, target, K, T_world_cam = _motion(config)
+    body = build_body(config.animal, p, config.seed)
+    eye = T_world_cam[:, :2, 3]
+    parts = surroundings(target[:, :2], eye, p.height, clutter=config.clutter, seed=config.seed)
+    coat = Part(body.vertices, body.triangles, body.colors, ANIMAL, grain=0.35, grain_size=0.012 * p.height)
+    toward = float(np.arctan2(*(eye - target[:, :2]).mean(0)[::-1]))
+    scene = Scene({"animal": coat, **parts}, light(p.height, toward, config.seed))
+    rng = np.random.default_rng([config.seed, 7])
+    for i in range(len(motion.t)):
+        scene.move({"animal": body.skin(motion.keypoints[i], motion.lateral[i])})
+        image = scene.render(K, T_world_cam[i], (config.width, config.height), supersample=2)
+        noise = config.noise * rng.standard_normal(image.rgb.shape, np.float32)
+        progress.update((i + 1) / len(motion.t), f"frame {i + 1} of {len(motion.t)}")
+        yield np.clip(image.rgb + noise + 0.5, 0, 255).astype(np.uint8), image.mask(ANIMAL)
+
+
+def write_clip(out_dir: Path, config: Config, progress: Progress) -> None:
+    """Write `clip.mp4`, `truth.npz` and `masks.npz` (packed bits of the animal's silhouette, and their shape) into `out_dir`.
+
+    Raises:
+        UsageError: the animal cannot move as asked.
+    """
+    arrays = truth(config)
+    masks: list[np.ndarray] = []
+
+    def frames():
+        for rgb, mask in render(config, progress):
+            masks.append(mask)
+            yield rgb
+
+    clip = encode_mp4(frames(), config.fps, crf=config.crf, preset="slow")
+    out_dir.mkdir(parents=True, exist_ok=True)
+    stack = np.stack(masks)
+    np.savez_compressed(out_dir / "masks.npz", packed=np.packbits(stack, axis=-1), shape=np.array(stack.shape))
+    np.savez_compressed(out_dir / "truth.npz", **arrays)
+    (out_dir / "clip.mp4").write_bytes(clip)

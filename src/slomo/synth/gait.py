@@ -1,0 +1,209 @@
+"""The motion of the procedural animal: trunk along a path, paws that are still while they stand, legs by inverse kinematics."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slomo.synth.animal import FEET, KEYPOINTS, LEG_JOINTS, Proportions, rest_joints
+
+G = 9.81
+
+
+@dataclass(frozen=True)
+class Gait:
+    """Foot-fall pattern.
+
+    Attributes:
+        phases: touch-down of FEET as fractions of the stride.  duty: fraction of the stride that a foot stands.
+        froude: v^2 / (g hip height) at the usual speed.  rate: stride frequency in units of sqrt(g / hip height).
+    """
+
+    phases: tuple[float, float, float, float]
+    duty: float
+    froude: float
+    rate: float
+
+
+GAITS = {
+    "walk": Gait((0.25, 0.75, 0.0, 0.5), 0.62, 0.12, 0.30),  # lateral sequence: HL, FL, HR, FR
+    "pace": Gait((0.08, 0.58, 0.0, 0.5), 0.58, 0.14, 0.31),
+    "trot": Gait((0.5, 0.0, 0.0, 0.5), 0.52, 0.27, 0.39),
+    "stand": Gait((0.0, 0.0, 0.0, 0.0), 1.0, 0.0, 0.2),
+}
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The animal over time.
+
+    Attributes:
+        t: (T,) s.  keypoints: (T, N, 3) m, world, in order of `KEYPOINTS`.  contact: (T, 4) bool, in order of `FEET`.
+        lateral: (T, 3) unit vector to the trunk's left.
+    """
+
+    t: np.ndarray
+    keypoints: np.ndarray
+    contact: np.ndarray
+    lateral: np.ndarray
+
+
+def smooth_random(rng: np.random.Generator, t: np.ndarray, period: float, n: int) -> np.ndarray:
+    """(T, n) smooth curves of about unit amplitude that change over `period` s: sums of sines."""
+    k = np.arange(1, 5)
+    a, b = rng.uniform(0, 2 * np.pi, (4, n)), rng.uniform(0.7, 1.3, (4, n))
+    wave = np.sin(2 * np.pi * t[:, None, None] * (k[:, None] * b / (2.5 * period)) + a)
+    return (wave / np.sqrt(k)[:, None]).sum(1) / 1.44
+
+
+class _Path:
+    """Where the trunk's middle is and looks at time t: constant speed (m/s) and turning rate (rad/s)."""
+
+    def __init__(self, speed: float, turn: float, middle: float):
+        self.speed, self.turn, self.middle = speed, turn, middle
+
+    def at(self, t: np.ndarray, x: np.ndarray | float, y: np.ndarray | float) -> np.ndarray:
+        """(..., 2) m, world, of the trunk-fixed point (x, y): x forward from the pelvis, y left."""
+        a = self.turn * t
+        s = self.speed * t
+        u = s * np.sinc(a / np.pi)
+        w = s * np.where(np.abs(a) < 1e-9, a / 2, (1 - np.cos(a)) / np.where(np.abs(a) < 1e-9, 1, a))
+        x = x - self.middle
+        return np.stack([u + np.cos(a) * x - np.sin(a) * y, w + np.sin(a) * x + np.cos(a) * y], -1)
+
+
+def _two_bones(a: np.ndarray, c: np.ndarray, ab: float, bc: float, bend: np.ndarray) -> np.ndarray:
+    """(T, 3) the joint between `a` and `c` (T, 3) m that bends towards `bend` (T, 3); lengths m."""
+    d = c - a
+    n = np.linalg.norm(d, axis=1, keepdims=True)
+    if np.any(n > ab + bc):
+        raise ValueError("leg does not reach")
+    x = d / n
+    along = (ab**2 - bc**2 + n**2) / (2 * n)
+    y = bend - (bend * x).sum(1, keepdims=True) * x
+    return a + along * x + np.sqrt(np.maximum(ab**2 - along**2, 0)) * y / np.linalg.norm(y, axis=1, keepdims=True)
+
+
+def _feet(gait: Gait, rate: float, t: np.ndarray, path: _Path, rest: dict[str, np.ndarray], lift: float, rng):
+    """Paw positions (T, 4, 3), contact (T, 4), and the signed stride phase (T, 4): stance 0..1, swing 1..2."""
+    paws, contact, phase = np.zeros((len(t), 4, 3)), np.zeros((len(t), 4), bool), np.zeros((len(t), 4))
+    start = rng.uniform()
+    for i, leg in enumerate(FEET):
+        home = rest[f"{leg}_paw"]
+        stride = t * rate + start - gait.phases[i] if path.speed or path.turn else np.zeros_like(t)
+        k = np.floor(stride)
+        s = stride - k
+        middle = (k + gait.duty / 2 - start + gait.phases[i]) / rate  # time of mid-stance
+        foot = path.at(middle if path.speed or path.turn else 0 * t, home[0], home[1])
+        following = path.at(middle + 1 / rate, home[0], home[1])
+        contact[:, i] = s <= gait.duty
+        w = np.clip((s - gait.duty) / max(1 - gait.duty, 1e-9), 0, 1)
+        blend = w**3 * (10 - 15 * w + 6 * w**2)
+        paws[:, i, :2] = foot + blend[:, None] * (following - foot)
+        paws[:, i, 2] = home[2] + lift * np.sin(np.pi * w**0.8) ** 2
+        phase[:, i] = np.where(contact[:, i], s / gait.duty, 1 + w)
+    return paws, contact, phase
+
+
+def _rotation(yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
+    """(T, 3, 3) Rz Ry Rx, rad."""
+    c, s = np.cos, np.sin
+    z, o = np.zeros_like(yaw), np.ones_like(yaw)
+
+    def stack(rows) -> np.ndarray:
+        return np.stack([np.stack(r, -1) for r in rows], -2)
+
+    Rz = stack([[c(yaw), -s(yaw), z], [s(yaw), c(yaw), z], [z, z, o]])
+    Ry = stack([[c(pitch), z, s(pitch)], [z, o, z], [-s(pitch), z, c(pitch)]])
+    Rx = stack([[o, z, z], [z, c(roll), -s(roll)], [z, s(roll), c(roll)]])
+    return Rz @ Ry @ Rx
+
+
+def animate(p: Proportions, gait_name: str, t: np.ndarray, *, speed: float | None, turn: float, seed: int) -> Motion:
+    """Move the animal along a path through the origin.
+
+    Args:
+        p: proportions.  gait_name: key of `GAITS`.  t: (T,) s.
+        speed: m/s, or None for the usual speed of the gait.  turn: rad/s, positive to the left.  seed: of all small variations.
+    """
+    gait, rest, h = GAITS[gait_name], rest_joints(p), p.height
+    rng = np.random.default_rng([seed, 3])
+    hip = p.hip * h
+    usual = np.sqrt(gait.froude * G * hip)
+    v = usual if speed is None else speed
+    # Animals lengthen and quicken their stride together as they speed up.
+    rate = gait.rate * np.sqrt(G / hip) * (np.sqrt(v / usual) if usual and v else 1.0)
+    path = _Path(v, turn, p.trunk * h / 2)
+    paws, contact, phase = _feet(gait, rate, t, path, rest, 0.10 * h, rng)
+
+    moving = 1.0 if v or turn else 0.0
+    beat = 2 * np.pi * (t * rate + rng.uniform())
+    slow = smooth_random(rng, t, 1.5, 8)
+    bob = 0.008 * h * moving * np.cos(2 * beat) + 0.004 * h * slow[:, 0] * (2 - moving)
+    yaw, roll = turn * t, 0.025 * moving * np.sin(beat) + 0.01 * slow[:, 1]
+    pitch = 0.012 * moving * np.sin(2 * beat + 1.0) + 0.008 * slow[:, 2]
+    bend = np.clip(0.35 * turn * p.trunk * h / max(v, 0.3), -0.5, 0.5) + 0.05 * moving * np.sin(beat + 0.7)
+    one = np.ones_like(t)
+
+    def pose(drop: float) -> dict[str, np.ndarray]:
+        """Trunk joints (T, 3), and shoulders and hips, with the trunk lowered by `drop` m."""
+        R = _rotation(yaw, pitch, roll)
+        fore = R @ _rotation(bend / 2, 0 * t, 0 * t)  # rear and fore halves bend about the middle of the spine
+        aft = R @ _rotation(-bend / 2, 0 * t, 0 * t)
+        middle = rest["spine_mid"]
+        centre = np.concatenate([path.at(t, middle[0] * one, 0 * one), (middle[2] - drop + bob)[:, None]], 1)
+        nod = 0.05 * moving * np.sin(2 * beat + 0.4) + 0.09 * slow[:, 3]
+        look = fore @ _rotation(0.5 * bend + 0.18 * slow[:, 4], nod, 0 * t)
+        wag = aft @ _rotation(0.30 * slow[:, 5] + 0.12 * np.sin(beat), 0.15 * slow[:, 6], 0 * t)
+        out: dict[str, np.ndarray] = {"spine_mid": centre}
+
+        def hang(name: str, parent: str, R: np.ndarray) -> None:
+            out[name] = out[parent] + R @ (rest[name] - rest[parent])
+
+        hang("withers", "spine_mid", fore)
+        hang("pelvis", "spine_mid", aft)
+        hang("tail_base", "pelvis", aft)
+        hang("tail_tip", "tail_base", wag)
+        hang("neck", "withers", look)
+        hang("head", "neck", look)
+        hang("nose", "head", look @ _rotation(0.15 * slow[:, 4], 0.05 * slow[:, 7], 0 * t))
+        for side in ("left", "right"):
+            hang(f"front_{side}_shoulder", "withers", fore)
+            hang(f"hind_{side}_hip", "pelvis", aft)
+        return out
+
+    def legs(joints: dict[str, np.ndarray]) -> None:
+        forward = np.stack([np.cos(yaw), np.sin(yaw), 0 * t], 1)
+        for i, leg in enumerate(FEET):
+            top, mid, low, paw = (f"{leg}_{n}" for n in LEG_JOINTS[leg.split("_")[0]])
+            front = leg.startswith("front")
+            r = rest[low] - rest[paw]
+            length, tilt = np.linalg.norm(r), np.arctan2(-r[0], r[2])  # the last bone leans back by `tilt`
+            ph = phase[:, i]
+            stance, swing = np.clip(ph, 0, 1), np.clip(ph - 1, 0, 1)
+            ease = swing**2 * (3 - 2 * swing)
+            if front:  # the shoulder blade swings with the leg
+                ahead = 0.035 * h * moving * np.where(ph <= 1, np.cos(np.pi * stance), 2 * ease - 1)
+                joints[top] = joints[top] + ahead[:, None] * forward
+            # The heel comes up at the end of the stance, the paw folds in swing and reaches out before touch-down.
+            off = 0.55 if front else 0.65
+            lean = tilt - moving * (
+                off * np.clip((stance - 0.45) / 0.55, 0, 1) ** 2 - 0.18 * np.cos(np.pi * stance / 2)
+            )
+            lean = lean - moving * (1.0 if front else 0.45) * np.sin(np.pi * swing) ** 2 * (1 - 0.3 * swing)
+            lean = lean + moving * ease * (off + 0.18)
+            joints[paw] = paws[:, i]
+            joints[low] = paws[:, i] + length * (-np.sin(lean)[:, None] * forward + np.cos(lean)[:, None] * [0, 0, 1.0])
+            ab, bc = np.linalg.norm(rest[mid] - rest[top]), np.linalg.norm(rest[low] - rest[mid])
+            joints[mid] = _two_bones(joints[top], joints[low], ab, bc, -forward if front else forward)
+        joints["chest"] = (joints["front_left_shoulder"] + joints["front_right_shoulder"]) / 2
+
+    # Lower the trunk by the least that lets every leg reach at every time.
+    for drop in np.linspace(0, 0.25, 51) * h:
+        joints = pose(drop)
+        try:
+            legs(joints)
+        except ValueError:
+            continue
+        lateral = np.stack([-np.sin(yaw), np.cos(yaw), 0 * t], 1)
+        return Motion(t, np.stack([joints[n] for n in KEYPOINTS], 1), contact, lateral)
+    raise ValueError(f"the legs do not reach at {v:.2f} m/s")
