@@ -8,6 +8,7 @@ import pytest
 from slomo.robot import load_robot
 from slomo.terrain import Box, Terrain
 from slomo.track.joint_space import JointSpace
+from slomo.track.mpc import PlanPoint
 from slomo.track.simulation import ARMATURE, Simulation
 
 NAMES = ("go1", "a1", "go2")
@@ -26,6 +27,11 @@ def point_foot_standing(robot):
     base = [0.0, 0.0, robot.standing_height]
     feet = robot.nominal_feet + base
     return np.concatenate([base, [0, 0, 0, 1.0], feet.ravel()])
+
+
+def plan_point(q, v):
+    zero = np.zeros((4, 3))
+    return PlanPoint(q[:3], q[3:7], v[:3], v[3:6], q[7:].reshape(-1, 3), v[6:].reshape(-1, 3), zero, zero)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -141,7 +147,7 @@ def test_state_and_pose_are_inverse_and_velocities_are_derivatives():
     ahead, _ = joints.state(pin.integrate(robot.model, q, v * dt), v)
     np.testing.assert_allclose((ahead[:3] - q_point[:3]) / dt, v_point[:3], atol=1e-4)
     np.testing.assert_allclose((ahead[7:] - q_point[7:]) / dt, v_point[6:], atol=1e-4)
-    command = joints.command(q_point, v_point, np.zeros(12), q)
+    command = joints.command(plan_point(q_point, v_point), u=np.zeros((4, 3)), q=q)
     np.testing.assert_allclose(command.v, v[6:], atol=1e-2)
 
 
@@ -151,11 +157,11 @@ def test_forces_of_the_legs_are_those_of_statics():
     joints = JointSpace(robot)
     q = robot.q_nominal.copy()
     q[3:7] = pin.Quaternion(pin.rpy.rpyToMatrix(0.2, -0.3, 1.0)).coeffs()
-    u = np.tile([5.0, -3.0, 30.0], 4)
+    u = np.tile([5.0, -3.0, 30.0], (4, 1))
     q_point, v_point = joints.state(q, np.zeros(18))
-    tau = joints.command(q_point, v_point, u, q).tau
+    tau = joints.command(plan_point(q_point, v_point), u=u, q=q).tau
     for j in range(12):
         v = np.zeros(18)
         v[6 + j] = 1.0
         _, speeds = joints.state(q, v)
-        assert tau[j] == pytest.approx(-u @ speeds[6:], abs=1e-9)
+        assert tau[j] == pytest.approx(-u.ravel() @ speeds[6:], abs=1e-9)

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports]
+from scipy.spatial.transform import Rotation
 
 from slomo.robot import Robot
+from slomo.track.mpc import PlanPoint
 
 Array = np.ndarray
 
@@ -83,7 +85,8 @@ class JointSpace:
 
     def pose(self, q_point: Array) -> Array:
         """(nq,) whole configuration with the base and the feet of a point-foot configuration (7 + 3 C,)."""
-        R, feet = _feet_in_base(q_point)
+        R = Rotation.from_quat(q_point[3:7]).as_matrix()
+        feet = (q_point[7:].reshape(-1, 3) - q_point[:3]) @ R
         T_world_root = pin.SE3(R, q_point[:3] + self._raise) * self._T_root_base.inverse()
         return np.concatenate([pin.SE3ToXYZQUAT(T_world_root), self.solve(feet)])
 
@@ -100,24 +103,25 @@ class JointSpace:
         speeds = [pin.getFrameVelocity(self.model, self.data, f, world).linear for f in self._feet]
         return np.concatenate([base, *points]), np.concatenate([twist.linear, omega, *speeds])
 
-    def command(self, q_point: Array, v_point: Array, u: Array, q: Array) -> JointCommand:
-        """Joint targets of a point-foot state and the torques of its leg forces.
+    def command(self, target: PlanPoint, *, u: Array, q: Array) -> JointCommand:
+        """Joint targets of a point-foot state and the torques of leg forces.
 
         tau = -J^T R^T u: the legs press the feet down with -u so that they carry the body with u.
 
         Args:
-            q_point: (7 + 3 C,), v_point: (6 + 3 C,) where the robot should be, as in `motion.Reference`.
-            u: (3 C,) N, world, forces of the feet on the body.
+            target: where the robot should be.
+            u: (C, 3) N, world, forces of the feet on the body.
             q: (nq,) where the robot is, for the Jacobian of the forces.
         """
-        R, feet = _feet_in_base(q_point)
+        R = Rotation.from_quat(target.quat_xyzw).as_matrix()
+        feet = (target.points - target.position) @ R
         joints = self.solve(feet)
         _, J = self._feet_in_root(joints)
-        relative = (v_point[6:].reshape(-1, 3) - v_point[:3]) @ R - np.cross(v_point[3:6], feet)
+        relative = (target.point_velocities - target.velocity) @ R - np.cross(target.angular_velocity, feet)
         speeds = _damped_solve(J, (relative @ self._T_root_base.rotation.T).ravel())
         _, J_now = self._feet_in_root(q[7:])
-        R_root = pin.XYZQUATToSE3(q[:7]).rotation
-        tau = -J_now.T @ (u.reshape(-1, 3) @ R_root).ravel()
+        R_root = Rotation.from_quat(q[3:7]).as_matrix()
+        tau = -J_now.T @ (u @ R_root).ravel()
         return JointCommand(
             joints,
             np.clip(speeds, -self.robot.velocity, self.robot.velocity),
@@ -133,12 +137,6 @@ class JointSpace:
         world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         J = np.vstack([pin.getFrameJacobian(self.model, self.data, f, world)[:3, 6:] for f in self._feet])
         return p, J
-
-
-def _feet_in_base(q_point: Array) -> tuple[Array, Array]:
-    """(3, 3) base orientation and (C, 3) m feet in the base frame."""
-    R = pin.Quaternion(*q_point[[6, 3, 4, 5]]).normalized().matrix()
-    return R, (q_point[7:].reshape(-1, 3) - q_point[:3]) @ R
 
 
 def _damped_solve(J: Array, y: Array) -> Array:
