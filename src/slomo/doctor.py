@@ -53,9 +53,12 @@ def _robots() -> Check:
 
 
 def _weights() -> Check:
-    from slomo.reconstruct.u2net import WEIGHTS_VARIABLE, cached_path, find_weights
+    import pooch
 
-    looked = f"{WEIGHTS_VARIABLE}={os.environ.get(WEIGHTS_VARIABLE, '(unset)')}, {cached_path()}"
+    from slomo.reconstruct.u2net import WEIGHTS_NAME, WEIGHTS_VARIABLE, find_weights
+
+    cached = Path(pooch.os_cache("slomo")) / WEIGHTS_NAME
+    looked = f"{WEIGHTS_VARIABLE}={os.environ.get(WEIGHTS_VARIABLE, '(unset)')}, {cached}"
     try:
         path = find_weights()
     except SlomoError as e:

@@ -78,7 +78,7 @@ STAGES: dict[str, StageSpec] = {
             "camera", _RECONSTRUCT, "reconstruct", "run_camera", "CameraConfig", "CAMERA_VERSION", ("decode", "masks")
         ),
         StageSpec(
-            "reconstruct", _RECONSTRUCT, "reconstruct", "run_fit", "FitConfig", "FIT_VERSION",
+            "reconstruct", "slomo.reconstruct.fit_stage", "reconstruct", "run_fit", "FitConfig", "FIT_VERSION",
             ("decode", "masks", "camera"), optional=("skeleton",),
         ),
         StageSpec(
@@ -231,7 +231,9 @@ class Project:
     @staticmethod
     def _choose_masks(found: dict[str, Path], segmenter: str) -> None:
         """Leave only what the segmenter reads, so that nothing else is in the key."""
-        if "masks" in found or segmenter == "motion":
+        if segmenter not in ("auto", "user"):
+            found.pop("masks", None)
+        if segmenter in ("motion", "user") or "masks" in found:
             found.pop("weights", None)
         elif "weights" not in found and (weights := _find_weights()):
             found["weights"] = weights

@@ -75,6 +75,7 @@ class RunProgress:
             self._signals.check()
 
     def note(self, message: str) -> None:
+        message = message.removeprefix(f"{self._stage}: ")
         if message not in self.notes:
             self.notes.append(message)
             self._console.note(f"{self._stage}: {message}")

@@ -16,7 +16,7 @@ from typing import Any
 import slomo
 from slomo import settings
 from slomo.console import Console
-from slomo.errors import MissingInput
+from slomo.errors import InvalidData, MissingInput, StageFailed, UsageError
 from slomo.pipeline import STAGES, Identity, Project
 from slomo.progress import RunProgress, Signals
 from slomo.stage import Inputs
@@ -104,7 +104,8 @@ class Runner:
             m = self._ensure(stage, before, touch=True)
             if show:
                 shown = self._ensure("report", self._require("report"), touch=True)
-                self.console.note(f"report: {self.project.root / shown['directory']}")
+                for name in shown["files"]:
+                    self.console.note(f"report: {self.project.root / shown['directory'] / name}")
         return m
 
     def _require(self, stage: str) -> dict[str, Manifest]:
@@ -168,7 +169,11 @@ class Runner:
         )
         started, wall, cpu = datetime.now(UTC), time.perf_counter(), time.process_time()
         progress.update(0.0, "starting")
-        artifact = spec.of_module(spec.run)(inputs, project.config(stage), progress)
+        try:
+            artifact = spec.of_module(spec.run)(inputs, project.config(stage), progress)
+        except (InvalidData, UsageError, StageFailed):
+            store.forget(stage, key)  # to go on from there would end the same way
+            raise
         seconds = time.perf_counter() - wall
         about = {
             "robot": project.robot.name if spec.robot else None,

@@ -5,6 +5,7 @@ change a result is written here too, so that the file always says how the artifa
 """
 
 import difflib
+import inspect
 import re
 import tomllib
 from collections.abc import Mapping
@@ -200,17 +201,23 @@ def template(configs: Mapping[str, type]) -> str:
     out = ["# Parameters of this slomo project. What is commented out shows the default.", "", "[inputs]"]
     out += [f'# {name} = ""  # {what}' for name, what in INPUTS.items()]
     for section, config in configs.items():
+        if not fields(config):
+            continue
         out += ["", f"[{section}]"]
-        comments = _comments(config)
+        about = _comments(config)
         for name, value in asdict(config()).items():
             shown = "" if value is None else f" {toml_value(value)}"
-            out.append(f"# {name} ={shown}" + (f"  # {comments[name]}" if name in comments else ""))
+            out.append(f"# {name} ={shown}" + (f"  # {about[name]}" if name in about else ""))
     return "\n".join(out) + "\n"
 
 
 def _comments(config: type) -> dict[str, str]:
-    """Field name -> the comment at the end of its line in the source."""
-    import inspect
-
-    found = re.findall(r"^\s+(\w+)\s*:[^#\n]*=[^#\n]*#\s*(.+)$", inspect.getsource(config), re.MULTILINE)
-    return dict(found)
+    """Field name -> what its line's comment or the record's docstring (`name: text`) says of it."""
+    names = [f.name for f in fields(config)]
+    found: dict[str, str] = {}
+    for line in (inspect.getdoc(config) or "").splitlines():
+        for chunk in re.split(r"(?<=\.)  (?=\w)", line):
+            if m := re.fullmatch(r"\s*(\w+(?:, \w+)*): (.+)", chunk):
+                found |= dict.fromkeys(m[1].split(", "), m[2])
+    found |= dict(re.findall(r"^\s+(\w+)\s*:[^#\n]*=[^#\n]*#\s*(.+)$", inspect.getsource(config), re.MULTILINE))
+    return {n: found[n] for n in names if n in found}

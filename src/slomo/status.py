@@ -57,9 +57,10 @@ def _state(project: Project, stage: str, before: Mapping[str, State]) -> State:
     if who := project.store.holder(stage, key):
         return State(stage, label, "running", (who,), key, command=command)
     m = project.store.manifest(stage, key)
+    if m and m["failure"]:
+        return State(stage, label, "failed", (m["failure"],), key, m, command)
     if m and pointer and pointer["key"] == key:
-        failed = (m["failure"],) if m["failure"] else ()
-        return State(stage, label, "failed" if failed else "current", failed, key, m, command)
+        return State(stage, label, "current", (), key, m, command)
     why = _changes(project, identity, pointer)
     if m:
         why += ("an artifact for the present parameters is in the store",)

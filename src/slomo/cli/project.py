@@ -6,13 +6,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from slomo.cli.session import Session, command
+from slomo.errors import SlomoError
 
 if TYPE_CHECKING:
     from slomo.status import State
 
 
 def _all_states(session: Session, robot: str | None) -> "dict[str, State]":
-    """Label -> state of every stage, for `robot` or for every robot that has artifacts."""
+    """Label -> state of every stage, for `robot` or for every robot that has artifacts and still exists."""
     from slomo.pipeline import Project
     from slomo.status import states
 
@@ -24,7 +25,15 @@ def _all_states(session: Session, robot: str | None) -> "dict[str, State]":
         if project.given(role):
             found |= {s.label: s for s in states(project, last).values()}
     for name in sorted(robots):
-        found |= {s.label: s for s in states(Project(session.root, name), "report").values()}
+        own = Project(session.root, name)
+        try:
+            own.robot  # noqa: B018 (loads it)
+        except SlomoError as e:
+            if robot:
+                raise
+            session.console.note(str(e))
+            continue
+        found |= {s.label: s for s in states(own, "report").values()}
     return found
 
 
@@ -69,7 +78,10 @@ def add_commands(app: typer.Typer) -> None:
                 lines += [f"    run `{s.command}`"] if s.status not in ("current", "running") else []
         if not found:
             lines = [f"nothing yet in {session.root}; run `slomo reconstruct CLIP` or `slomo import KEYPOINTS`"]
-        shown = [{k: v for k, v in asdict(s).items() if k != "manifest"} for s in found.values()]
+        facts = ("directory", "files", "started", "seconds", "notes")
+        shown = [
+            {**asdict(s), "manifest": {k: s.manifest[k] for k in facts} if s.manifest else None} for s in found.values()
+        ]
         session.emit("\n".join(lines), {"project": str(session.root), "stages": shown})
 
     @command(app, "gc")

@@ -1,12 +1,16 @@
 """What all commands share: their common options, the project, results on stdout, errors and exit codes."""
 
 import contextlib
+import ctypes
+import errno
 import inspect
 import os
+import signal
 import sys
 import tempfile
+import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from slomo.console import Console
-from slomo.errors import InvalidData, SlomoError, StageFailed
+from slomo.errors import Interrupted, InvalidData, SlomoError, StageFailed
 
 if TYPE_CHECKING:
     from slomo.pipeline import Project
@@ -54,6 +58,7 @@ class Session:
     no_wait: bool = False
     fresh: bool = False
     overrides: list[str] = field(default_factory=list)
+    result: str | None = None
 
     def __post_init__(self):
         self.console = Console(quiet=self.quiet)
@@ -109,6 +114,16 @@ class Session:
         resolved, root = path.resolve(), self.root.resolve()
         return resolved.relative_to(root).as_posix() if resolved.is_relative_to(root) else str(resolved)
 
+    def given(self, role: str) -> bool:
+        """Whether slomo.toml names the user's file for `role`."""
+        from slomo.pipeline import Project
+
+        return Project(self.root).given(role) is not None
+
+    def choice_reopened(self, role: str) -> dict[str, None]:
+        """A first clip, or first key points, undo an earlier choice between the two."""
+        return {} if self.given(role) else {"motion": None}
+
     def runner(self, project: "Project") -> "Runner":
         """What makes the project's artifacts."""
         from slomo.runner import Runner
@@ -116,16 +131,18 @@ class Session:
         return Runner(project, self.console, wait=not self.no_wait, fresh=self.fresh)
 
     def emit(self, text: str, data: Any) -> None:
-        """Print the command's result on stdout."""
+        """Keep the command's result; it is printed on stdout when the command has ended."""
         from slomo.store import json_bytes
 
-        self.console.close()
-        print(json_bytes(data).decode().rstrip("\n") if self.as_json else text, flush=True)
+        self.result = json_bytes(data).decode().rstrip("\n") if self.as_json else text
 
     def emit_artifact(self, m: "Manifest") -> None:
         """Print an artifact's path or manifest. Raises `StageFailed` if its result is not usable."""
         path = self.root / m["directory"]
         self.emit(str(path), m)
+        if m["stage"] == "report":
+            for name in m["files"]:
+                self.console.note(f"report: {path / name}")
         if m["failure"]:
             raise StageFailed(m["failure"], where=m["stage"], todo=f"its best result is in {path}")
 
@@ -133,37 +150,62 @@ class Session:
 def _crashed(session: Session, error: Exception) -> str:
     """Keep the traceback where the user can find it; one line."""
     text = f"{' '.join(sys.argv)}\n\n{''.join(traceback.format_exception(error))}"
-    places = [session.root / ".slomo", Path(tempfile.gettempdir())]
-    for folder in places:
+    summary = f"internal error: {type(error).__name__}: {error}"
+    for path in (session.root / ".slomo" / "crash.txt", Path(tempfile.gettempdir()) / "slomo-crash.txt"):
         with contextlib.suppress(OSError):
-            if folder is places[0] and (session.root / "slomo.toml").is_file():
-                folder.mkdir(exist_ok=True)
-            (folder / "crash.txt").write_text(text)
-            shown = ".slomo/crash.txt" if folder is places[0] else folder / "crash.txt"
-            return f"internal error: {type(error).__name__}: {error} (traceback in {shown})"
-    return f"internal error: {type(error).__name__}: {error}"
+            if (session.root / "slomo.toml").is_file():
+                path.parent.mkdir(exist_ok=True)
+            path.write_text(text)
+            return f"{summary} (traceback in {path})"
+    return summary
+
+
+@contextlib.contextmanager
+def _stdout_to_stderr() -> Iterator[None]:
+    """What libraries print, from Python or C, goes to stderr: stdout is for the result."""
+    flush_c = ctypes.CDLL(None).fflush
+    sys.stdout.flush()
+    flush_c(None)
+    stdout = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    finally:
+        flush_c(None)
+        os.dup2(stdout, 1)
+        os.close(stdout)
+
+
+def _terminated(number: int, frame: object) -> None:
+    raise Interrupted(number)
 
 
 def _exit_code(session: Session, run: Callable[[], None]) -> int:
     """Run a command; every way in which it can end, as an exit code and at most one line on stderr."""
+    line, code = "", 0
     try:
-        run()
-        return 0
+        with _stdout_to_stderr():
+            run()
     except SlomoError as e:
         line, code = str(e), e.exit_code
     except KeyboardInterrupt:
         line, code = "interrupted", 130
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        return 1
     except MemoryError:
         line, code = "out of memory; use a shorter or smaller clip (--duration)", 1
-    except (typer.Exit, typer.Abort):
-        raise
+    except OSError as e:
+        known = e.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM)
+        line, code = f"{e.filename or 'writing'}: {e.strerror}" if known else _crashed(session, e), 1
     except Exception as e:
         line, code = _crashed(session, e), 1
     session.console.close()
-    session.console.line(f"slomo: {' '.join(line.split())}")
+    if session.result is not None:
+        try:
+            print(session.result, flush=True)
+        except BrokenPipeError:  # the reader, `head` say, has had enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    if line:
+        session.console.line(f"slomo: {' '.join(line.split())}")
     return code
 
 
@@ -183,9 +225,9 @@ def command(app: typer.Typer, name: str, *, runs: bool = False) -> Callable[[Cal
             if "overrides" in mine:
                 mine["overrides"] = mine["overrides"] or []
             session = Session(**mine)
-            code = _exit_code(session, lambda: f(session, **given))
-            session.console.close()
-            raise typer.Exit(code)
+            if threading.current_thread() is threading.main_thread():
+                signal.signal(signal.SIGTERM, _terminated)
+            raise typer.Exit(_exit_code(session, lambda: f(session, **given)))
 
         own = list(inspect.signature(f, eval_str=True).parameters.values())[1:]
         added = [

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from slomo.cli.session import RobotOption, Session, command
-from slomo.errors import MissingInput, UsageError
+from slomo.errors import UsageError
 
 KEYPOINT_SUFFIXES = (".json", ".npz")
 BUILT_IN_SKELETONS = ("quadruped", "human")
@@ -40,7 +40,7 @@ def add_commands(app: typer.Typer) -> None:
             str | None, typer.Option("--skeleton", metavar="quadruped|human|PATH", help="Whose bones to fit.")
         ] = None,
         segmenter: Annotated[
-            str | None, typer.Option("--segmenter", metavar="auto|u2netp|motion", help="How the subject is found.")
+            str | None, typer.Option("--segmenter", metavar="auto|u2netp|motion|user", help="How the subject is found.")
         ] = None,
         masks: Annotated[
             Path | None, typer.Option("--masks", metavar="DIR", help="Your own masks, one image a frame.")
@@ -66,10 +66,14 @@ def add_commands(app: typer.Typer) -> None:
         inputs = {role: session.user_path(path, role) for role, path in files.items() if path is not None}
         changes = _skeleton(session, skeleton)
         changes["inputs"] = changes.get("inputs", {}) | inputs
+        if clip is not None:
+            changes["inputs"] |= session.choice_reopened("clip")
         changes["decode"] = _given(start=start, duration=duration)
         changes["masks"] = _given(segmenter=segmenter)
-        changes["camera"] = _given(fov=fov)
-        changes["reconstruct"] = changes.get("reconstruct", {}) | _given(length=length)
+        if masks is not None and segmenter is None:
+            changes["masks"] = {"segmenter": None}  # the default takes the masks that are given
+        changes["camera"] = _given(fov_deg=fov)
+        changes["reconstruct"] = changes.get("reconstruct", {}) | _given(length_m=length)
         project = session.configure(changes)
         session.emit_artifact(session.runner(project).make("reconstruct"))
 
@@ -83,7 +87,8 @@ def add_commands(app: typer.Typer) -> None:
         \b
         slomo import cat00.json
         """
-        project = session.configure({"inputs": {"keypoints": session.user_path(file, "keypoints")}})
+        inputs = {"keypoints": session.user_path(file, "keypoints")} | session.choice_reopened("keypoints")
+        project = session.configure({"inputs": inputs})
         session.emit_artifact(session.runner(project).make("import"))
 
     @command(app, "retarget", runs=True)
@@ -168,7 +173,7 @@ def add_commands(app: typer.Typer) -> None:
             role = "keypoints" if source.suffix in KEYPOINT_SUFFIXES else "clip"
             changes = {role: session.user_path(source, role)}
             changes["motion"] = "import" if role == "keypoints" else "reconstruct"
+            if not session.given("clip" if role == "keypoints" else "keypoints"):
+                changes["motion"] = None
         project = session.configure({"inputs": changes}, robot)
-        if source is None and not (session.root / "slomo.toml").is_file():
-            raise MissingInput("no project and no clip", where=session.root, todo="run `slomo run CLIP --robot NAME`")
         session.emit_artifact(session.runner(project).make("track" if no_video else "report"))

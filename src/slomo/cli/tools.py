@@ -3,6 +3,7 @@
 import typer
 
 from slomo.cli.session import Session, command
+from slomo.errors import SlomoError
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -34,7 +35,8 @@ def add_commands(app: typer.Typer) -> None:
         healthy = all(c.ok or not c.needed for c in checks)
         session.emit("\n".join(lines), {"healthy": healthy, "checks": [vars(c) for c in checks]})
         if not healthy:
-            raise typer.Exit(1)
+            bad = [c.name for c in checks if c.needed and not c.ok]
+            raise SlomoError(f"not usable: {', '.join(bad)}", where="doctor", todo="see the lines marked FAIL")
 
     weights = typer.Typer(help="Weights of the segmentation network.", no_args_is_help=True, rich_markup_mode=None)
     app.add_typer(weights, name="weights")

@@ -19,24 +19,27 @@ def command_line() -> str:
     return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
-def _lock(path: Path) -> FileLock:
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    return FileLock(path)
+def _acquired(lock: FileLock) -> bool:
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        return False
+    return True
 
 
 def holder(path: Path) -> str | None:
     """Who holds the lock at `path` ("pid 7, `slomo run`"), or None. Never blocks."""
     if not path.exists():
         return None
-    lock = _lock(path)
+    lock = FileLock(path)
     try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        who = read_json(path.with_suffix(".json")) or {}
-        return f"pid {who.get('pid', 'unknown')}, `{who.get('command', 'unknown command')}`"
-    lock.release()
-    return None
+        if _acquired(lock):
+            lock.release()
+            return None
+    except OSError:  # who may only read the project cannot tell
+        return None
+    who = read_json(path.with_suffix(".json")) or {}
+    return f"pid {who.get('pid', 'unknown')}, `{who.get('command', 'unknown command')}`"
 
 
 @contextlib.contextmanager
@@ -51,19 +54,15 @@ def locked(
         note: told once for whom we wait.
         check: called while waiting; may raise.
     """
-    lock = _lock(path)
-    told = False
-    while True:
-        try:
-            with writing(path):
-                lock.acquire(timeout=0)
-            break
-        except Timeout:
+    lock, told = FileLock(path), False
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        while not _acquired(lock):
             who = holder(path)
             if who is None:  # gone, or only looked at by `slomo status`
                 continue
             if not wait:
-                raise Locked(f"{what} is being made by {who}", todo="wait for it, or leave out --no-wait") from None
+                raise Locked(f"{what} is being made by {who}", todo="wait for it, or leave out --no-wait")
             if not told:
                 note(f"waiting for {what}: {who} works on it")
                 told = True
