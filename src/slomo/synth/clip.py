@@ -3,6 +3,7 @@
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +11,8 @@ from slomo.errors import UsageError
 from slomo.formats.mp4 import encode_mp4
 from slomo.raycast import Part, Scene
 from slomo.stage import Progress
-from slomo.synth.animal import ANIMALS, BONES, FEET, KEYPOINTS, build_body, proportions
+from slomo.synth.animal import ANIMALS, BONES, FEET, KEYPOINTS, proportions
+from slomo.synth.body import build_body
 from slomo.synth.gait import GAITS, animate
 from slomo.synth.scene import ANIMAL, CAMERAS, camera, light, surroundings
 
@@ -21,7 +23,8 @@ class Config:
 
     Attributes:
         animal: "dog", "cat" or "horse"; its proportions and coat vary with the seed.
-        gait: "walk", "pace", "trot" or "stand".  speed: m/s; 0 = the usual speed of the gait.  turn: degrees/s, positive to the left.
+        gait: "walk", "pace", "trot" or "stand".  speed: m/s; 0 = the usual speed of the gait.
+        turn: degrees/s, positive to the left.
         camera: "follow", "orbit", "pan" or "static".  view: degrees, 0 = the left flank, 90 = from the front.
         shake: camera shake, 1 = a hand.  clutter: posts near the animal.
         seconds, fps, width, height: of the clip (px).
@@ -77,14 +80,15 @@ def _motion(config: Config):
     return p, motion, target, *cam
 
 
-def truth(config: Config) -> dict[str, np.ndarray]:
+def truth(config: Config) -> dict[str, Any]:
     """The arrays of `truth.npz`, without rendering anything.
 
-    `keypoints` (T, N, 3) m, world, z up, ground at 0, joint centres named `keypoint_names`; `T_world_cam` (T, 4, 4) in the OpenCV
-    convention; `K` (3, 3) px; `foot_contact` (T, 4) for `foot_names`; `body_length` m (withers to tail base); `contact_height` (m) and
-    `contact_speed` (m/s) as thresholds for a contact detector; `bones` as "a-b"; `config` as JSON.
+    `keypoints` (T, N, 3) m, world, z up, ground at 0, joint centres named `keypoint_names`; `T_world_cam` (T, 4, 4) in
+    the OpenCV convention; `K` (3, 3) px; `foot_contact` (T, 4) for `foot_names`; `body_length` m (withers to tail
+    base); `contact_height` (m) and `contact_speed` (m/s) as thresholds for a contact detector; `bones` as "a-b";
+    `config` as JSON.
     """
-    p, motion, _, K, T_world_cam = _motion(config)
+    _, motion, _, K, T_world_cam = _motion(config)
     k = motion.keypoints
     a, b = KEYPOINTS.index("withers"), KEYPOINTS.index("tail_base")
     body_length = float(np.linalg.norm(k[:, a] - k[:, b], axis=1).mean())
@@ -126,7 +130,7 @@ def render(config: Config, progress: Progress):
 
 
 def write_clip(out_dir: Path, config: Config, progress: Progress) -> None:
-    """Write `clip.mp4`, `truth.npz` and `masks.npz` (packed bits of the animal's silhouette, and their shape) into `out_dir`.
+    """Write `clip.mp4`, `truth.npz` and `masks.npz` (packed bits of the silhouette, and their shape) into `out_dir`.
 
     Raises:
         UsageError: the animal cannot move as asked.

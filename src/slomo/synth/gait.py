@@ -1,4 +1,4 @@
-"""The motion of the procedural animal: trunk along a path, paws that are still while they stand, legs by inverse kinematics."""
+"""The motion of the procedural animal: trunk along a path, paws still while they stand, legs by inverse kinematics."""
 
 from dataclasses import dataclass
 
@@ -123,7 +123,8 @@ def animate(p: Proportions, gait_name: str, t: np.ndarray, *, speed: float | Non
 
     Args:
         p: proportions.  gait_name: key of `GAITS`.  t: (T,) s.
-        speed: m/s, or None for the usual speed of the gait.  turn: rad/s, positive to the left.  seed: of all small variations.
+        speed: m/s, or None for the usual speed of the gait.  turn: rad/s, positive to the left.
+        seed: of all small variations.
     """
     gait, rest, h = GAITS[gait_name], rest_joints(p), p.height
     rng = np.random.default_rng([seed, 3])
@@ -193,7 +194,7 @@ def animate(p: Proportions, gait_name: str, t: np.ndarray, *, speed: float | Non
             lean = lean + moving * ease * (off + 0.18)
             joints[paw] = paws[:, i]
             joints[low] = paws[:, i] + length * (-np.sin(lean)[:, None] * forward + np.cos(lean)[:, None] * [0, 0, 1.0])
-            ab, bc = np.linalg.norm(rest[mid] - rest[top]), np.linalg.norm(rest[low] - rest[mid])
+            ab, bc = float(np.linalg.norm(rest[mid] - rest[top])), float(np.linalg.norm(rest[low] - rest[mid]))
             joints[mid] = _two_bones(joints[top], joints[low], ab, bc, -forward if front else forward)
         joints["chest"] = (joints["front_left_shoulder"] + joints["front_right_shoulder"]) / 2
 

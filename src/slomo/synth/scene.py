@@ -54,7 +54,7 @@ def surroundings(path: np.ndarray, eye: np.ndarray, size: float, *, clutter: boo
 
 
 def light(size: float, toward: float, seed: int) -> Light:
-    """Sun, sky and meadow for an animal of `size` m seen from azimuth `toward` (rad): the sun is behind the camera's shoulder."""
+    """Sun (behind the camera's shoulder), sky and meadow for an animal of `size` m seen from azimuth `toward` (rad)."""
     rng = np.random.default_rng([seed, 5])
     a = toward + rng.uniform(0.3, 1.1) * rng.choice([-1, 1])
     s = size / 0.56
@@ -76,8 +76,8 @@ def camera(
     """K (3, 3) px and T_world_cam (T, 4, 4).
 
     Args:
-        mode: "follow" walks along with 75 % of the animal's motion, "orbit" also goes around it at 10 degrees a second, "pan" stands
-            and turns, "static" is on a tripod.
+        mode: "follow" walks along with 75 % of the animal's motion, "orbit" also goes around it at 10 degrees a second,
+            "pan" stands and turns, "static" is on a tripod.
         target: (T, 3) m, the animal's middle.  t: (T,) s.  length: m, nose to tail.
         view: rad, from which side: 0 = its left flank, positive towards its front.  shake: 1 = a hand, 0 = a tripod.
     """

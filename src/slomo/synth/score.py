@@ -1,0 +1,94 @@
+"""How far a reconstruction is from the truth of a rendered clip, in per cent of the animal's body length."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from slomo.errors import InvalidData
+from slomo.motion import KeypointMotion
+
+ROOTS = ("pelvis", "tail_base", "spine_mid")
+
+
+def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Scale, rotation (3, 3) and translation (3,) that minimise sum |s R x + t - y|^2 over rows x, y of (N, 3).
+
+    Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
+    """
+    mean_x, mean_y = source.mean(0), target.mean(0)
+    x, y = source - mean_x, target - mean_y
+    U, S, Vt = np.linalg.svd(y.T @ x)
+    sign = np.array([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)])
+    R = (U * sign) @ Vt
+    s = float(S @ sign / max((x**2).sum(), 1e-30))
+    return s, R, mean_y - s * R @ mean_x
+
+
+def _at(t: np.ndarray, motion: KeypointMotion, names: list[str], tolerance: float) -> np.ndarray:
+    """(len(t), len(names), 3) key points at times t, linear between frames, NaN outside or where missing."""
+    out = np.full((len(t), len(names), 3), np.nan)
+    inside = (t >= motion.t[0] - tolerance) & (t <= motion.t[-1] + tolerance)
+    for i, name in enumerate(names):
+        k = motion.index(name)
+        seen = (motion.confidence[:, k] > 0).astype(float)
+        ok = inside & (np.interp(t, motion.t, seen) > 1 - 1e-6)
+        for c in range(3):
+            out[ok, i, c] = np.interp(t[ok], motion.t, motion.positions[:, k, c])
+    return out
+
+
+def score(motion: KeypointMotion, truth: Mapping[str, Any]) -> dict[str, Any]:
+    """Compare key points with the arrays of a `truth.npz`; names that both have count.
+
+    Returns:
+        pa_mpjpe_percent: mean distance after a similarity alignment of each frame alone.
+        w_mpjpe_percent: after one similarity alignment of the whole motion.
+        foot_mpjpe_percent: the same, of the feet.
+        root_path_error_percent: mean distance of the root (same alignment), in per cent of the distance that it
+            travelled; None for a subject that stays within half its length.
+        gravity_error_degrees: angle between the two verticals in that alignment.
+        matched: number of common key points.  coverage: part of the true frames with at least four of them.
+
+    Raises:
+        InvalidData: fewer than four common key points, or no common time.
+    """
+    true_names = [str(n) for n in truth["keypoint_names"]]
+    names = [n for n in true_names if n in motion.names]
+    if len(names) < 4:
+        raise InvalidData("shares fewer than four key points with the truth", where="keypoints", valid=true_names)
+    fps, length = float(truth["fps"]), float(truth["body_length"])
+    Y = np.asarray(truth["keypoints"], float)[:, [true_names.index(n) for n in names]]
+    X = _at(np.arange(len(Y)) / fps, motion, names, 0.75 / fps)
+    ok = np.asarray(np.isfinite(X).all(-1) & np.isfinite(Y).all(-1))
+    frames = np.flatnonzero(ok.sum(1) >= 4)
+    if not len(frames):
+        raise InvalidData("has no frame in common with the truth", where="keypoints")
+
+    aligned = []
+    for f in frames:
+        s, R, shift = similarity(X[f, ok[f]], Y[f, ok[f]])
+        aligned.append(np.linalg.norm(s * X[f, ok[f]] @ R.T + shift - Y[f, ok[f]], axis=-1))
+    s, R, shift = similarity(X[ok], Y[ok])
+    error = np.where(ok, np.linalg.norm(s * X @ R.T + shift - Y, axis=-1), np.nan)
+
+    percent = 100 / length
+    feet = [names.index(n) for n in map(str, truth["foot_names"]) if n in names]
+    root = next((n for n in ROOTS if n in names), None)
+    path_error = None
+    if root is not None:
+        k = names.index(root)
+        # Nine frames smooth the body's bob away, so that the distance is the path's.
+        smooth = np.stack([np.convolve(np.pad(c, 4, "edge"), np.full(9, 1 / 9), "valid") for c in Y[:, k, :2].T], 1)
+        distance = float(np.linalg.norm(np.diff(smooth, axis=0), axis=1).sum())
+        if distance > 0.5 * length and np.isfinite(error[:, k]).any():
+            path_error = float(100 * np.nanmean(error[:, k]) / distance)
+    return dict(
+        pa_mpjpe_percent=float(np.concatenate(aligned).mean() * percent),
+        w_mpjpe_percent=float(np.nanmean(error) * percent),
+        foot_mpjpe_percent=float(np.nanmean(error[:, feet]) * percent) if feet else None,
+        root_path_error_percent=path_error,
+        gravity_error_degrees=float(np.degrees(np.arccos(np.clip(R[2, 2], -1, 1)))),
+        matched=len(names),
+        coverage=len(frames) / len(Y),
+    )

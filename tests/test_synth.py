@@ -1,0 +1,174 @@
+"""The procedural animal: its motion, its truth, the embedded clip, and the scorer."""
+
+import importlib.util
+import json
+from importlib.resources import files
+from itertools import pairwise
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from slomo.errors import InvalidData, UsageError
+from slomo.motion import KeypointMotion
+from slomo.stage import Silent
+from slomo.synth.animal import ANIMALS, BONES, FEET, KEYPOINTS, proportions, rest_joints
+from slomo.synth.clip import Config, truth, write_clip
+from slomo.synth.gait import GAITS, animate
+from slomo.synth.score import score
+
+SHARED = Path(__file__).parents[2] / "shared"
+EMBEDDED = Path(str(files("slomo"))) / "assets" / "walk"
+T = np.arange(90) / 30
+
+
+@pytest.mark.parametrize("gait", GAITS)
+@pytest.mark.parametrize("animal", ANIMALS)
+def test_paws_stand_still_and_bones_keep_their_length(animal, gait):
+    p = proportions(animal, 3)
+    m = animate(p, gait, T, speed=None, turn=0.2 if gait != "stand" else 0.0, seed=3)
+    rest = rest_joints(p)
+    for i, foot in enumerate(FEET):
+        path = m.keypoints[:, KEYPOINTS.index(f"{foot}_paw")]
+        both = m.contact[1:, i] & m.contact[:-1, i]
+        assert np.abs(np.diff(path, axis=0)[both]).max() < 1e-9
+        assert np.allclose(path[m.contact[:, i], 2], path[:, 2].min())
+    legs = [(a, b) for a, b in BONES if a[0:5] in ("front", "hind_")]
+    for a, b in legs:
+        length = np.linalg.norm(m.keypoints[:, KEYPOINTS.index(a)] - m.keypoints[:, KEYPOINTS.index(b)], axis=1)
+        assert np.allclose(length, np.linalg.norm(rest[a] - rest[b]), rtol=1e-6)
+
+
+def test_a_walk_is_a_lateral_sequence_that_always_has_support():
+    m = animate(proportions("dog", 0), "walk", np.arange(400) / 100, speed=None, turn=0.0, seed=0)
+    touch = [(int(k), f) for i, f in enumerate(FEET) for k in np.flatnonzero(np.diff(m.contact[:, i].astype(int)) == 1)]
+    order = [f for _, f in sorted(touch)]
+    follows = {
+        "hind_left": "front_left",
+        "front_left": "hind_right",
+        "hind_right": "front_right",
+        "front_right": "hind_left",
+    }
+    assert len(order) > 8
+    assert all(b == follows[a] for a, b in pairwise(order))
+    assert m.contact.sum(1).min() >= 2
+    assert m.contact.mean() > 0.55
+
+
+def test_it_moves_at_the_speed_and_turns_as_asked():
+    m = animate(proportions("dog", 1), "walk", T, speed=0.5, turn=0.0, seed=0)
+    path = m.keypoints[:, KEYPOINTS.index("spine_mid")]
+    assert np.linalg.norm(path[-1, :2] - path[0, :2]) == pytest.approx(0.5 * T[-1], rel=0.01)
+    m = animate(proportions("dog", 1), "walk", T, speed=0.5, turn=0.5, seed=0)
+    a = np.unwrap(np.arctan2(m.lateral[:, 1], m.lateral[:, 0]))
+    assert a[-1] - a[0] == pytest.approx(0.5 * T[-1], rel=1e-6)
+
+
+def test_too_fast_is_one_line_for_the_user():
+    with pytest.raises(UsageError, match="reach"):
+        truth(Config(speed=9.0))
+    with pytest.raises(UsageError, match="valid: follow"):
+        Config(camera="drone")
+
+
+def test_truth_is_deterministic_and_depends_on_the_seed():
+    a, b, c = truth(Config(seed=1)), truth(Config(seed=1)), truth(Config(seed=2))
+    for k in a:
+        np.testing.assert_array_equal(a[k], b[k])
+    assert not np.allclose(a["keypoints"], c["keypoints"])
+
+
+@pytest.mark.parametrize("camera", ["follow", "orbit", "pan", "static"])
+def test_cameras(camera):
+    z = truth(Config(camera=camera, seed=4))
+    R, c = z["T_world_cam"][:, :3, :3], z["T_world_cam"][:, :3, 3]
+    np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (len(R), 1, 1)), atol=1e-9)
+    assert np.all(R[:, 2, 1] < -0.8)  # the image's down is the world's down
+    moved = np.linalg.norm(c - c[0], axis=1).max() / z["body_length"]
+    assert moved < 0.1 if camera in ("pan", "static") else moved > 0.5
+    x = np.einsum("tji,tnj->tni", R, z["keypoints"] - c[:, None])
+    uv = (x @ z["K"].T)[..., :2] / x[..., 2:]
+    assert (uv > 0).all()  # the whole animal is in the picture, all the time
+    assert (uv < z["image_size"]).all()
+
+
+def test_a_clip_has_what_it_promises(tmp_path):
+    config = Config(seconds=0.2, width=160, height=90, animal="cat", gait="trot", seed=5)
+    write_clip(tmp_path, config, Silent())
+    with av.open(str(tmp_path / "clip.mp4")) as c:
+        assert c.streams.video[0].codec_context.name == "h264"
+        frames = [f.to_ndarray(format="rgb24") for f in c.decode(video=0)]
+    assert len(frames) == 6
+    assert frames[0].shape == (90, 160, 3)
+    with np.load(tmp_path / "masks.npz") as z:
+        masks = np.unpackbits(z["packed"], axis=-1)[..., : z["shape"][2]].astype(bool)
+    with np.load(tmp_path / "truth.npz") as z:
+        arrays = dict(z)
+    assert masks.shape == (6, 90, 160)
+    # The silhouette holds the projected joints.
+    x = np.einsum(
+        "tji,tnj->tni", arrays["T_world_cam"][:, :3, :3], arrays["keypoints"] - arrays["T_world_cam"][:, None, :3, 3]
+    )
+    uv = np.rint((x @ arrays["K"].T)[..., :2] / x[..., 2:]).astype(int)
+    inside = np.stack([m[p[:, 1], p[:, 0]] for m, p in zip(masks, uv, strict=True)])
+    assert inside.mean() > 0.85
+
+
+def test_embedded_clip_is_what_its_config_renders():
+    with np.load(EMBEDDED / "truth.npz") as z:
+        stored = dict(z)
+    again = truth(Config(**json.loads(str(stored["config"]))))
+    assert set(again) == set(stored)
+    for k in ("keypoints", "T_world_cam", "K", "body_length"):
+        np.testing.assert_allclose(again[k], stored[k], atol=1e-9)
+    np.testing.assert_array_equal(again["foot_contact"], stored["foot_contact"])
+    assert (EMBEDDED / "clip.mp4").stat().st_size < 600_000
+    with av.open(str(EMBEDDED / "clip.mp4")) as c:
+        frames = sum(1 for _ in c.decode(video=0))
+    assert frames == len(stored["keypoints"]) == 90
+
+
+def _motion(z, keypoints: np.ndarray) -> KeypointMotion:
+    t = np.arange(len(keypoints)) / float(z["fps"])
+    names = tuple(map(str, z["keypoint_names"]))
+    return KeypointMotion(t, keypoints, names, np.ones(keypoints.shape[:2]))
+
+
+def test_score_ignores_a_similarity_and_measures_noise():
+    z = truth(Config())
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    out = score(_motion(z, 1.7 * z["keypoints"] @ turn.T + [3.0, 1, 0]), z)
+    assert out["w_mpjpe_percent"] < 1e-9
+    assert out["pa_mpjpe_percent"] < 1e-9
+    assert out["gravity_error_degrees"] < 1e-3
+    moved = z["keypoints"] + 0.02 * np.random.default_rng(0).standard_normal(z["keypoints"].shape)
+    expected = 100 * 0.02 * np.sqrt(8 / np.pi) / z["body_length"]  # mean length of a normal vector in space
+    assert score(_motion(z, moved), z)["w_mpjpe_percent"] == pytest.approx(expected, rel=0.03)
+    with pytest.raises(InvalidData, match="four"):
+        score(KeypointMotion(T, np.zeros((90, 2, 3)), ("a", "b"), np.ones((90, 2))), z)
+
+
+def test_score_agrees_with_the_judge():
+    path = SHARED / "truth" / "score.py"
+    if not path.exists():
+        pytest.skip("needs ../shared/truth/score.py")
+    spec = importlib.util.spec_from_file_location("judge", path)
+    assert spec is not None
+    assert spec.loader is not None
+    judge = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(judge)
+    z = truth(Config(seed=6))
+    rng = np.random.default_rng(1)
+    drift = np.cumsum(0.004 * rng.standard_normal((90, 1, 3)), 0)
+    m = _motion(z, 0.8 * z["keypoints"] + drift + 0.01 * rng.standard_normal(z["keypoints"].shape))
+    ours = score(m, z)
+    theirs = judge.score(m.to_arrays(), {k: np.asarray(v) for k, v in z.items()})
+    for mine, his in (
+        ("pa_mpjpe_percent", "pa_mpjpe_pct"),
+        ("w_mpjpe_percent", "w_mpjpe_pct"),
+        ("foot_mpjpe_percent", "foot_mpjpe_pct"),
+        ("root_path_error_percent", "root_traj_error_pct_of_distance"),
+        ("gravity_error_degrees", "gravity_error_deg"),
+    ):
+        assert ours[mine] == pytest.approx(theirs[his], abs=1e-3)
