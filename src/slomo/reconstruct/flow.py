@@ -1,0 +1,74 @@
+"""Dense optical flow between consecutive frames and what follows from it: consistency, warping, chains.
+
+Flow (H, W, 2) px is x then y: the pixel p of the first image is at p + flow[p] in the second.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Flow:
+    """Flow of a clip of T frames.
+
+    Attributes:
+        forward: (T-1, H, W, 2) float16 px, frame t -> t+1.
+        backward: (T-1, H, W, 2) float16 px, frame t+1 -> t.
+        consistent: (T-1, H, W) bool, at pixels of frame t: forward then backward leads home.
+    """
+
+    forward: np.ndarray
+    backward: np.ndarray
+    consistent: np.ndarray
+
+    def step(self, source: int, target: int) -> np.ndarray:
+        """(H, W, 2) float32 px from frame `source` to its neighbour `target`."""
+        field = self.forward[source] if target > source else self.backward[target]
+        return field.astype(np.float32)
+
+    def chain(self, source: int, target: int) -> np.ndarray:
+        """(H, W, 2) float32 px from frame `source` to any frame `target`, by composing the steps between."""
+        total = np.zeros((*self.forward.shape[1:3], 2), np.float32)
+        direction = 1 if target > source else -1
+        for t in range(source, target, direction):
+            total += sample(self.step(t, t + direction), total)
+        return total
+
+
+def dense_flow(frames: np.ndarray, progress=lambda fraction: None) -> Flow:
+    """DIS flow (Kroeger et al., ECCV 2016; medium preset) of (T, H, W, 3) uint8 RGB frames, both ways."""
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    gray = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames]
+    shape = (len(frames) - 1, *frames.shape[1:3])
+    forward, backward = np.empty((*shape, 2), np.float16), np.empty((*shape, 2), np.float16)
+    consistent = np.empty(shape, bool)
+    for t, (a, b) in enumerate(pairwise(gray)):
+        there, back = dis.calc(a, b, None), dis.calc(b, a, None)  # type: ignore[call-overload]
+        forward[t], backward[t] = there, back
+        consistent[t] = _consistent(there, back)
+        progress((t + 1) / shape[0])
+    return Flow(forward, backward, consistent)
+
+
+def _consistent(there: np.ndarray, back: np.ndarray) -> np.ndarray:
+    """Forward-backward check with the bound of Sundaram, Brox and Keutzer (ECCV 2010), equation 5."""
+    home = sample(back, there)
+    error = np.sum((there + home) ** 2, axis=-1)
+    return error < 0.01 * (np.sum(there**2, axis=-1) + np.sum(home**2, axis=-1)) + 0.5
+
+
+def sample(image: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """`image` (H, W[, C]) read bilinearly at p + offset[p] for every pixel p; the border value extends outwards."""
+    h, w = offset.shape[:2]
+    x, y = np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32))
+    return cv2.remap(image, x + offset[..., 0], y + offset[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def inside(offset: np.ndarray) -> np.ndarray:
+    """(H, W) bool: p + offset[p] lies in the image."""
+    h, w = offset.shape[:2]
+    x, y = np.arange(w) + offset[..., 0], np.arange(h)[:, None] + offset[..., 1]
+    return (x >= 0) & (x <= w - 1) & (y >= 0) & (y <= h - 1)

@@ -1,0 +1,172 @@
+"""Gravity and the ground plane: from sparse points where the camera moves, from vertical lines where it only turns."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Plane:
+    """The plane {x: normal . x = offset} in the world of the sparse points.
+
+    Attributes:
+        inliers: (P,) bool, points on it.  support: their share of all weight.
+        tilt_std: rad, standard deviation of the normal's direction along the weaker axis.
+    """
+
+    normal: np.ndarray
+    offset: float
+    inliers: np.ndarray
+    support: float
+    tilt_std: float
+
+
+def find_ground(
+    points: np.ndarray,
+    weights: np.ndarray,
+    up: np.ndarray,
+    centers: np.ndarray,
+    *,
+    max_tilt: float = 0.8,
+    seed: int = 0,
+) -> Plane | None:
+    """RANSAC for the ground: below all cameras, its normal within `max_tilt` rad of `up`, most points on it.
+
+    Args:
+        points: (P, 3) sparse points.  weights: (P,) how near each lies to where the subject stands.
+        up: (3,) rough up (the mean of the images').  centers: (T, 3) camera centres.
+    """
+    if len(points) < 20:
+        return None
+    rng = np.random.default_rng(seed)
+    origin = centers.mean(0)
+    distance = np.linalg.norm(points - origin, axis=-1)
+    tolerance = 0.006 * distance  # depth of a sparse point is the less certain the farther it is
+    best, best_score = None, 0.0
+    chance = weights / weights.sum()
+    for _ in range(1500):
+        a, b, c = points[rng.choice(len(points), 3, replace=False, p=chance)]
+        normal = np.cross(b - a, c - a)
+        size = np.linalg.norm(normal)
+        if size < 1e-9 * distance.max() ** 2:
+            continue
+        normal /= size * np.sign(normal @ up or 1.0)
+        if normal @ up < np.cos(max_tilt) or np.any(centers @ normal - normal @ a <= 0):
+            continue
+        height = points @ normal - normal @ a
+        # What hangs below the ground speaks against it: table tops and steps have floor under them.
+        score = weights[abs(height) < tolerance].sum() - weights[height < -4 * tolerance].sum()
+        if score > best_score:
+            best, best_score = (normal, float(normal @ a)), score
+    if best is None:
+        return None
+    normal, offset = best
+    for _ in range(5):
+        on = abs(points @ normal - offset) < 1.5 * tolerance
+        if on.sum() < 8:
+            return None
+        w = (weights / tolerance**2)[on]
+        mean = np.average(points[on], axis=0, weights=w)
+        spread = (points[on] - mean) * np.sqrt(w)[:, None]
+        fitted = np.linalg.svd(spread, full_matrices=False)[2][2]
+        normal = fitted * np.sign(fitted @ up or 1.0)
+        offset = float(normal @ mean)
+    on = abs(points @ normal - offset) < 1.5 * tolerance
+    flat = points[on] - points[on].mean(0)
+    extent, noise = np.linalg.svd(flat, compute_uv=False)[1], np.std(flat @ normal)
+    return Plane(normal, offset, on, float(weights[on].sum() / weights.sum()), float(noise / max(extent, 1e-12)))
+
+
+@dataclass(frozen=True)
+class Gravity:
+    """Up in the frame of one camera that does not move, as pitch and roll.
+
+    Attributes:
+        up: (3,) unit vector, camera frame (OpenCV: y down, z forward).
+        pitch, roll: rad; pitch is how far the camera looks down.  pitch_std, roll_std: one standard deviation.
+        lines: number of line segments that agree with it.
+    """
+
+    up: np.ndarray
+    pitch: float
+    roll: float
+    pitch_std: float
+    roll_std: float
+    lines: int
+
+
+# Hand-held footage of an animal looks down on it: prior of pitch and roll (rad), mean and standard deviation.
+PITCH_PRIOR, PITCH_STD = np.radians(12.0), np.radians(8.0)
+ROLL_STD = np.radians(2.5)
+
+
+def up_vector(pitch: float, roll: float) -> np.ndarray:
+    """Up in the camera frame for a camera that looks down by `pitch` and is rolled clockwise by `roll` (rad)."""
+    c, s = np.cos(pitch), np.sin(pitch)
+    return np.array([c * -np.sin(roll), -c * np.cos(roll), -s])
+
+
+def gravity_from_lines(
+    frames: np.ndarray, masks: np.ndarray, R_world_cam: np.ndarray, focal: float, center: np.ndarray
+) -> Gravity:
+    """Most probable pitch and roll given line segments that may be vertical, and the prior.
+
+    Every image of a vertical line spans, with the camera's centre, a plane that contains up: normal . up = 0. The
+    segments' angular errors are taken as a mixture of a Gaussian (0.6 degrees) and clutter, maximised over a grid.
+
+    Args:
+        frames: (N, H, W, 3) uint8 RGB, a few of them.  masks: (N, H, W) bool.  R_world_cam: (N, 3, 3); the world is
+            the frame in which the result is expressed.
+    """
+    normals, lengths = [], []
+    for frame, mask, R in zip(frames, masks, R_world_cam, strict=True):
+        n, length = _upright_segments(frame, mask, focal, center)
+        normals.append(n @ R.T)
+        lengths.append(length)
+    normals, lengths = np.concatenate(normals), np.concatenate(lengths) / max(1, len(frames))
+    pitch, roll = np.meshgrid(
+        np.radians(np.arange(-20, 50.5, 0.5)), np.radians(np.arange(-15, 15.25, 0.25)), indexing="ij"
+    )
+    grid = np.stack([-np.cos(pitch) * np.sin(roll), -np.cos(pitch) * np.cos(roll), -np.sin(pitch)], -1)
+    sigma, clutter = np.radians(0.6), 0.03
+    log = -0.5 * ((pitch - PITCH_PRIOR) / PITCH_STD) ** 2 - 0.5 * (roll / ROLL_STD) ** 2
+    if len(normals):
+        error = np.arcsin(np.clip(grid @ normals.T, -1, 1)) / sigma
+        # A segment counts by its length in tenths of the picture's height; fifty of them say no more than ten do.
+        weight = lengths / (0.1 * frames.shape[1])
+        weight *= min(1.0, 10.0 / max(weight.sum(), 1e-9))
+        log = log + np.log(clutter + np.exp(-0.5 * error**2)) @ weight
+    p = np.exp(log - log.max())
+    p /= p.sum()
+    mean = float((p * pitch).sum()), float((p * roll).sum())
+    peak = np.unravel_index(p.argmax(), p.shape)
+    up = grid[peak]
+    agree = int((abs(np.arcsin(np.clip(normals @ up, -1, 1))) < 2 * sigma).sum()) if len(normals) else 0
+    return Gravity(
+        up=up,
+        pitch=float(pitch[peak]),
+        roll=float(roll[peak]),
+        pitch_std=float(np.sqrt((p * (pitch - mean[0]) ** 2).sum())),
+        roll_std=float(np.sqrt((p * (roll - mean[1]) ** 2).sum())),
+        lines=agree,
+    )
+
+
+def _upright_segments(frame: np.ndarray, mask: np.ndarray, focal: float, center: np.ndarray):
+    """Normals (L, 3), camera frame, of the planes through long segments within 25 degrees of the image's vertical, and
+    their lengths (L,) px."""
+    gray = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
+    found = cv2.createLineSegmentDetector().detect(gray)[0]
+    if found is None:
+        return np.zeros((0, 3)), np.zeros(0)
+    ends = found.reshape(-1, 2, 2).astype(float)
+    middle = ends.mean(1).round().astype(int)
+    away = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9), np.uint8))
+    outside = away[middle[:, 1].clip(0, gray.shape[0] - 1), middle[:, 0].clip(0, gray.shape[1] - 1)] == 0
+    d = ends[:, 1] - ends[:, 0]
+    length = np.linalg.norm(d, axis=-1)
+    keep = outside & (length > 0.05 * gray.shape[0]) & (abs(d[:, 0]) < np.tan(np.radians(25)) * abs(d[:, 1]))
+    rays = np.concatenate([(ends - center) / focal, np.ones((*ends.shape[:2], 1))], -1)
+    normal = np.cross(rays[:, 0], rays[:, 1])[keep]
+    return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12), length[keep]

@@ -1,0 +1,74 @@
+"""Segmenter that runs U2-Net-p on some frames, each cropped to where the subject should be, and blends over time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slomo.reconstruct.flow import Flow, sample
+from slomo.reconstruct.segment import Masks, Report, blend_over_time, box_of, component_at, no_subject
+from slomo.reconstruct.u2net import U2Net
+
+
+@dataclass(frozen=True)
+class SaliencySegmenter:
+    """U2-Net-p with tracking.
+
+    Attributes:
+        network: the loaded network.
+        every: the network runs on every n-th frame; flow fills the frames between.
+        probes: frames seen whole at first, to find where the subject is best seen.
+        margin: by which the subject's box is grown, in parts of its longer side, before cropping.
+    """
+
+    network: U2Net
+    every: int = 3
+    probes: int = 7
+    margin: float = 0.15
+    name: str = "u2netp"
+
+    def segment(self, frames: np.ndarray, flow: Flow, progress: Report) -> Masks:
+        T = len(frames)
+        keys = sorted({*range(0, T, self.every), T - 1})
+        whole = {}
+        for i, k in enumerate(np.linspace(0, len(keys) - 1, min(self.probes, len(keys))).round().astype(int)):
+            whole[keys[k]] = self.network(frames[keys[k]])
+            progress(0.2 * (i + 1) / self.probes)
+        seed = max(whole, key=lambda t: _clarity(whole[t]))
+        if _clarity(whole[seed]) <= 0:
+            raise no_subject(f"the network sees nothing that stands out in {len(whole)} frames across the clip")
+
+        layers: dict[int, np.ndarray] = {}
+        for order in (keys[keys.index(seed) :], keys[: keys.index(seed) + 1][::-1]):
+            self._track(order, whole[seed], frames, flow, layers)
+            progress(0.2 + 0.6 * len(layers) / len(keys))
+        probability = blend_over_time(layers, flow, lambda f: progress(0.8 + 0.15 * f))
+        masks = np.stack([component_at(p > 0.5, p > 0.8) for p in probability])
+        if not masks.any():
+            raise no_subject("the network's answer does not hold over time")
+        return Masks(masks, {"weights_sha256": self.network.digest, "network_frames": len(layers), "seed_frame": seed})
+
+    def _track(self, order: list[int], first: np.ndarray, frames, flow: Flow, layers: dict[int, np.ndarray]) -> None:
+        """Fill `layers` along `order`, whose first frame has the probability `first`."""
+        hint = component_at(first > 0.5)
+        for previous, t in zip([order[0], *order], order, strict=False):
+            if t != previous:
+                hint = sample(hint.astype(np.float32), flow.chain(t, previous)) > 0.5
+            seen = layers.get(t)
+            if seen is None:
+                box = box_of(hint, margin=self.margin) if hint.sum() > 50 else (0, 0, hint.shape[1], hint.shape[0])
+                seen = self.network.crop(frames[t], box)
+                seen = seen * component_at(seen > 0.3, hint if hint.any() else None)
+            layers[t] = seen
+            if (found := seen > 0.5).any():
+                hint = found
+
+
+def _clarity(probability: np.ndarray) -> float:
+    """How clearly one whole object stands out: confident largest component, away from the border."""
+    mask = component_at(probability > 0.5)
+    share = mask.mean()
+    if not 0.002 < share < 0.7:
+        return 0.0
+    border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()
+    confident = probability[mask].mean() * mask.sum() / max(1, (probability > 0.5).sum())
+    return float(confident * max(0.0, 1.0 - 4.0 * border) * min(1.0, share / 0.02))

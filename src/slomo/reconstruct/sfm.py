@@ -1,0 +1,157 @@
+"""Structure from motion by COLMAP (Schönberger and Frahm, CVPR 2016) on masked key frames, in a process of its own.
+
+The process keeps pycolmap and OpenCV, which do not load together, apart: this module must not import OpenCV before
+the work is handed over, and `python -m slomo.reconstruct.sfm DIR` is what runs it.
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slomo.errors import StageFailed
+
+
+@dataclass(frozen=True)
+class Structure:
+    """A sparse reconstruction of some frames; world frame and scale are arbitrary.
+
+    Attributes:
+        frames: (N,) int, the registered frames, increasing.
+        T_world_cam: (N, 4, 4) OpenCV convention.
+        focal: px.
+        points: (P, 3).
+        observations: (M, 2) int rows (place in `frames`, point).  xy: (M, 2) px, pixel centres at integers.
+        error_px: mean reprojection error.
+    """
+
+    frames: np.ndarray
+    T_world_cam: np.ndarray
+    focal: float
+    points: np.ndarray
+    observations: np.ndarray
+    xy: np.ndarray
+    error_px: float
+
+
+def reconstruct_structure(
+    frames: np.ndarray,
+    masks: np.ndarray,
+    keys: np.ndarray,
+    *,
+    focal: float,
+    refine_focal: bool,
+    features: int,
+    overlap: int,
+    seed: int = 0,
+    threads: int = 2,
+) -> Structure | None:
+    """Cameras of the frames `keys` and sparse points of what is not masked; None when COLMAP finds no model.
+
+    Args:
+        frames: (T, H, W, 3) uint8 RGB.  masks: (T, H, W) bool, left out.
+        focal: px, start, kept when not `refine_focal`.  features: per frame.  overlap: frames matched with each.
+
+    Raises:
+        StageFailed: the process died.
+    """
+    import cv2
+
+    with tempfile.TemporaryDirectory(prefix="slomo-sfm-") as folder:
+        root = Path(folder)
+        (root / "images").mkdir()
+        (root / "masks").mkdir()
+        around = np.ones((9, 9), np.uint8)
+        for k in keys:
+            cv2.imwrite(str(root / "images" / f"{k:06d}.png"), frames[k][..., ::-1])
+            free = 255 - 255 * cv2.dilate(masks[k].astype(np.uint8), around)
+            cv2.imwrite(str(root / "masks" / f"{k:06d}.png.png"), free)
+        height, width = frames.shape[1:3]
+        job = {
+            "focal": focal,
+            "center": [width / 2, height / 2],
+            "refine_focal": refine_focal,
+            "features": features,
+            "overlap": overlap,
+            "seed": seed,
+            "threads": threads,
+        }
+        (root / "job.json").write_text(json.dumps(job))
+        done = subprocess.run(
+            [sys.executable, "-m", "slomo.reconstruct.sfm", folder], capture_output=True, text=True, check=False
+        )
+        if done.returncode:
+            last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+            raise StageFailed(f"structure from motion ended with status {done.returncode}: {last}", where="camera")
+        if not (root / "out.npz").exists():
+            return None
+        with np.load(root / "out.npz") as z:
+            return Structure(**{k: z[k] if z[k].ndim else float(z[k]) for k in z.files})
+
+
+def _main(folder: str) -> None:
+    import pycolmap
+
+    root = Path(folder)
+    job = json.loads((root / "job.json").read_text())
+    pycolmap.logging.minloglevel = 2
+    pycolmap.set_random_seed(job["seed"])
+    database, images = root / "database.db", root / "images"
+
+    reader = pycolmap.ImageReaderOptions()
+    reader.mask_path = str(root / "masks")
+    reader.camera_model = "SIMPLE_PINHOLE"
+    reader.camera_params = ",".join(map(str, [job["focal"], *job["center"]]))
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.sift.max_num_features = job["features"]
+    extraction.num_threads, extraction.use_gpu = job["threads"], False
+    pycolmap.extract_features(
+        database,
+        images,
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=reader,
+        extraction_options=extraction,
+    )
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads, matching.use_gpu = job["threads"], False
+    pairing = pycolmap.SequentialPairingOptions()
+    pairing.overlap, pairing.quadratic_overlap, pairing.num_threads = job["overlap"], False, job["threads"]
+    pycolmap.match_sequential(database, matching_options=matching, pairing_options=pairing)
+    mapping = pycolmap.IncrementalPipelineOptions()
+    mapping.num_threads, mapping.random_seed = job["threads"], job["seed"]
+    mapping.multiple_models, mapping.extract_colors = False, False
+    mapping.ba_refine_focal_length = job["refine_focal"]
+    models = pycolmap.incremental_mapping(database, images, root, mapping)
+    if models:
+        model = max(models.values(), key=lambda m: m.num_reg_images())
+        np.savez(root / "out.npz", **_arrays(model))
+
+
+def _arrays(model) -> dict[str, np.ndarray]:
+    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    point_ids = sorted(model.points3D)
+    place = {p: n for n, p in enumerate(point_ids)}
+    T, observations, xy = [], [], []
+    for n, image in enumerate(images):
+        T.append(np.vstack([image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]]))
+        for point in image.points2D:
+            if point.has_point3D():
+                observations.append((n, place[point.point3D_id]))
+                xy.append(point.xy - 0.5)  # COLMAP puts the first pixel's centre at 0.5
+    return {
+        "frames": np.array([int(Path(image.name).stem) for image in images]),
+        "T_world_cam": np.array(T),
+        "focal": np.array(next(iter(model.cameras.values())).params[0]),
+        "points": np.array([model.points3D[p].xyz for p in point_ids]),
+        "observations": np.array(observations),
+        "xy": np.array(xy),
+        "error_px": np.array(model.compute_mean_reprojection_error()),
+    }
+
+
+if __name__ == "__main__":
+    _main(sys.argv[1])

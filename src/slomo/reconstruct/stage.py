@@ -1,0 +1,209 @@
+"""The parts of `reconstruct`, each cached on its own: decode, masks, camera, and the fit.
+
+Inputs by name: files "clip" (decode), "weights" and "masks" (masks); artifacts "decode", "masks".
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slomo.errors import UsageError
+from slomo.reconstruct.video import decode
+from slomo.stage import Artifact, Inputs, Progress
+
+DECODE_VERSION = 1
+MASKS_VERSION = 1
+CAMERA_VERSION = 1
+
+SEGMENTERS = ("auto", "u2netp", "motion", "user")
+
+
+@dataclass(frozen=True)
+class DecodeConfig:
+    """What is taken from the clip.
+
+    Attributes:
+        start: s from the clip's first frame.
+        duration: s; 0 takes everything to the end.
+        fps: frames per second at most; a slower clip keeps its own rate.
+        max_side: px, the longer side of the decoded frames at most.
+        max_frames: bound on memory; what a longer clip has more is left out, and said.
+    """
+
+    start: float = 0.0
+    duration: float = 0.0
+    fps: float = 30.0
+    max_side: int = 640
+    max_frames: int = 900
+
+
+@dataclass(frozen=True)
+class MasksConfig:
+    """How the subject is found.
+
+    Attributes:
+        segmenter: "auto" (the user's masks when given, else u2netp when its weights are at hand, else motion),
+            "u2netp", "motion" or "user".
+        network_every: the network runs on every n-th frame; flow fills the frames between.
+    """
+
+    segmenter: str = "auto"
+    network_every: int = 3
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """How the camera is found.
+
+    Attributes:
+        fov_deg: degrees, horizontal field of view; 0 means unknown: taken from the clip's metadata where there is one,
+            else `default_fov_deg`, and refined where the motion shows it. A given one is kept.
+        default_fov_deg: degrees, horizontal, where nothing else is known.
+        key_every: every n-th frame goes through structure from motion.
+        features: features a key frame.
+        overlap: key frames with which each is matched.
+        seed: of every random choice.
+    """
+
+    fov_deg: float = 0.0
+    default_fov_deg: float = 60.0
+    key_every: int = 3
+    features: int = 1200
+    overlap: int = 5
+    seed: int = 0
+
+
+def run_decode(inputs: Inputs, config: DecodeConfig, progress: Progress) -> Artifact:
+    """Decode the file "clip" into `frames.npz` (frames (T, H, W, 3) uint8 RGB, t (T,) s) and `video.json`.
+
+    Raises:
+        InvalidData: the file is no video, or too little of it can be decoded.
+        UsageError: a parameter is out of its range.
+    """
+    for name, least in (("start", 0.0), ("duration", 0.0), ("fps", 1.0), ("max_side", 64), ("max_frames", 8)):
+        if not getattr(config, name) >= least:
+            raise UsageError(f"is {getattr(config, name)}", where=f"decode.{name}", valid=[f"{least:g} and more"])
+    clip = decode(
+        Path(inputs.files["clip"]),
+        start=config.start,
+        duration=config.duration,
+        fps=config.fps,
+        max_side=config.max_side,
+        max_frames=config.max_frames,
+        progress=lambda f: progress.update(f, "decoding"),
+    )
+    if lost := clip.info["frames_lost"]:
+        progress.note(f"decode: the clip is damaged or cut off: {lost} frames are lost, {len(clip.t)} are used")
+    if dropped := clip.info["frames_dropped"]:
+        progress.note(f"decode: the clip is long: the last {dropped} frames are left out (choose with start, duration)")
+    return Artifact(npz={"frames.npz": {"frames": clip.frames, "t": clip.t}}, json={"video.json": clip.info})
+
+
+def run_masks(inputs: Inputs, config: MasksConfig, progress: Progress) -> Artifact:
+    """Find the subject: `masks.npz`, `flow.npz`, `report.json`.
+
+    Raises:
+        InvalidData: no subject is found, the user's masks do not fit, or the weights cannot be loaded.
+        UsageError: unknown segmenter, or what it needs was not given.
+    """
+    from slomo.reconstruct.flow import dense_flow
+    from slomo.reconstruct.segment import frame_quality
+
+    segmenter = _segmenter(inputs, config)
+    frames = inputs.artifacts["decode"].npz["frames.npz"]["frames"]
+    progress.note(f"masks: segmenter {segmenter.name}")
+    flow = dense_flow(frames, lambda f: progress.update(0.25 * f, "optical flow"))
+    found = segmenter.segment(frames, flow, lambda f: progress.update(0.25 + 0.7 * f, f"masks ({segmenter.name})"))
+    quality = frame_quality(found.masks, flow)
+    report = {
+        "segmenter": segmenter.name,
+        "quality_mean": float(quality.mean()),
+        "quality_min": float(quality.min()),
+        "area_mean": float(found.masks.mean()),
+        "frames_without_subject": int((~found.masks.any((1, 2))).sum()),
+        "flow_consistent": float(flow.consistent.mean()),
+    } | found.report
+    if quality.mean() < 0.6:
+        progress.note(f"masks: poor (quality {quality.mean():.2f}); look at them, or give your own with --masks")
+    return Artifact(
+        npz={
+            "masks.npz": {**pack(found.masks), "quality": quality.astype(np.float32)},
+            "flow.npz": {"flow": flow.forward, "consistent": pack(flow.consistent)["packed"]},
+        },
+        json={"report.json": report},
+    )
+
+
+def run_camera(inputs: Inputs, config: CameraConfig, progress: Progress) -> Artifact:
+    """Camera and ground: `camera.npz` (K (3, 3), T_world_cam (T, 4, 4)) and `report.json`.
+
+    Raises:
+        StageFailed: structure from motion died.
+        UsageError: a field of view that no lens has.
+    """
+    from slomo.reconstruct.camera import CameraSettings, estimate_camera
+
+    decoded = inputs.artifacts["decode"]
+    frames, t = decoded.npz["frames.npz"]["frames"], decoded.npz["frames.npz"]["t"]
+    masks = unpack(inputs.artifacts["masks"].npz["masks.npz"])
+    width = frames.shape[2]
+    for name in ("fov_deg", "default_fov_deg"):
+        value = getattr(config, name)
+        if not (0 < value < 170 or (value == 0 and name == "fov_deg")):
+            raise UsageError(f"is {value}", where=f"camera.{name}", valid=["more than 0 and less than 170 degrees"])
+    hint = decoded.json["video.json"].get("focal_px_hint", 0.0)
+    focal = 0.5 * width / np.tan(0.5 * np.radians(config.fov_deg or config.default_fov_deg))
+    source = "given" if config.fov_deg else "default"
+    if hint and not config.fov_deg:
+        focal, source = hint, "the clip's metadata"
+    settings = CameraSettings(
+        focal=float(focal),
+        refine_focal=not config.fov_deg,
+        key_every=config.key_every,
+        features=config.features,
+        overlap=config.overlap,
+        seed=config.seed,
+    )
+    path = estimate_camera(frames, masks, t, settings, progress)
+    report = path.report | {"focal_source": "refined" if path.report["focal_observed"] else source}
+    return Artifact(npz={"camera.npz": {"K": path.K, "T_world_cam": path.T_world_cam}}, json={"report.json": report})
+
+
+def pack(masks: np.ndarray) -> dict[str, np.ndarray]:
+    """(T, H, W) bool as packed bits and their shape."""
+    return {"packed": np.packbits(masks, axis=-1), "shape": np.array(masks.shape)}
+
+
+def unpack(arrays) -> np.ndarray:
+    """Inverse of `pack`: (T, H, W) bool."""
+    return np.unpackbits(arrays["packed"], axis=-1)[..., : int(arrays["shape"][2])].astype(bool)
+
+
+def _segmenter(inputs: Inputs, config: MasksConfig):
+    """The segmenter that the configuration and the files at hand decide on."""
+    name = config.segmenter
+    if name not in SEGMENTERS:
+        raise UsageError(f"unknown segmenter {name!r}", where="masks.segmenter", valid=SEGMENTERS)
+    if name == "auto":
+        name = "user" if "masks" in inputs.files else "u2netp" if "weights" in inputs.files else "motion"
+    if name == "user":
+        from slomo.reconstruct.user_masks import UserMasks
+
+        if "masks" not in inputs.files:
+            raise UsageError("no masks were given", where="masks.segmenter", todo="add --masks DIR")
+        return UserMasks(inputs.files["masks"])
+    if name == "u2netp":
+        from slomo.reconstruct.saliency import SaliencySegmenter
+        from slomo.reconstruct.u2net import WEIGHTS_VARIABLE, U2Net
+
+        if "weights" not in inputs.files:
+            raise UsageError(
+                "the weights of u2netp are not at hand",
+                where="masks.segmenter",
+                todo=f"set {WEIGHTS_VARIABLE} to their path, or use --segmenter motion",
+            )
+        return SaliencySegmenter(U2Net(inputs.files["weights"]), every=max(1, config.network_every))
+    from slomo.reconstruct.motion_segment import MotionSegmenter
+
+    return MotionSegmenter()

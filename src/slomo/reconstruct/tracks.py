@@ -1,0 +1,88 @@
+"""Background feature tracks: corners followed by Lucas-Kanade from frame to frame, outside the subject's mask."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+_LK = {"winSize": (15, 15), "maxLevel": 3, "criteria": (3, 20, 0.01)}
+_MAX_ROUND_TRIP = 0.4  # px, forward-backward error above which a track ends
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Observations of tracked corners.
+
+    Attributes:
+        frame, track: (M,) int, which frame and which track.
+        xy: (M, 2) px.
+    """
+
+    frame: np.ndarray
+    track: np.ndarray
+    xy: np.ndarray
+
+    def pairs(self, gaps: tuple[int, ...], frames: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Correspondences between frames of `frames` that lie `gaps` places apart in it.
+
+        Returns (P, 2) places in `frames`, (P, 2) px in the first and (P, 2) px in the second.
+        """
+        place = np.full(int(self.frame.max()) + 1, -1)
+        place[frames] = np.arange(len(frames))
+        keep = place[self.frame] >= 0
+        k, track, xy = place[self.frame[keep]], self.track[keep], self.xy[keep]
+        order = np.lexsort((k, track))
+        k, track, xy = k[order], track[order], xy[order]
+        which, first, second = [], [], []
+        index = {(int(a), int(b)): i for i, (a, b) in enumerate(zip(track, k, strict=True))}
+        for gap in gaps:
+            hit = [(i, index.get((int(a), int(b) + gap), -1)) for i, (a, b) in enumerate(zip(track, k, strict=True))]
+            found = np.array([h for h in hit if h[1] >= 0], dtype=int).reshape(-1, 2)
+            which.append(np.column_stack([k[found[:, 0]], k[found[:, 1]]]))
+            first.append(xy[found[:, 0]])
+            second.append(xy[found[:, 1]])
+        return np.concatenate(which), np.concatenate(first), np.concatenate(second)
+
+
+def follow(a: np.ndarray, b: np.ndarray, xy: np.ndarray, guess: np.ndarray | None = None):
+    """Follow points (N, 2) px from gray image a to b. Returns (N, 2) px and (N,) bool, which ones came home again."""
+    if len(xy) == 0:
+        return xy, np.zeros(0, bool)
+    p = xy.astype(np.float32)[:, None]
+    options = dict(_LK) | ({"flags": cv2.OPTFLOW_USE_INITIAL_FLOW} if guess is not None else {})
+    start = None if guess is None else guess.astype(np.float32)[:, None].copy()
+    q, found, _ = cv2.calcOpticalFlowPyrLK(a, b, p, start, **options)  # type: ignore[call-overload]
+    home, found_home, _ = cv2.calcOpticalFlowPyrLK(b, a, q, p.copy(), **_LK, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)  # type: ignore[call-overload]
+    good = (found[:, 0] > 0) & (found_home[:, 0] > 0) & (np.linalg.norm(home - p, axis=-1)[:, 0] < _MAX_ROUND_TRIP)
+    h, w = a.shape
+    end = q[:, 0]
+    return end, good & (end[:, 0] > 1) & (end[:, 0] < w - 2) & (end[:, 1] > 1) & (end[:, 1] < h - 2)
+
+
+def background_tracks(frames: np.ndarray, masks: np.ndarray, *, corners: int = 500, progress=lambda f: None) -> Tracks:
+    """Corners of (T, H, W, 3) uint8 RGB frames outside (T, H, W) masks, topped up to `corners` in every frame."""
+    gray = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames]
+    side = max(gray[0].shape)
+    around = np.ones((max(3, side // 40) | 1,) * 2, np.uint8)
+    free = [cv2.dilate(m.astype(np.uint8), around) == 0 for m in masks]
+    distance = side / 70
+    xy, ids, count = np.zeros((0, 2), np.float32), np.zeros(0, int), 0
+    seen: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    for t, image in enumerate(gray):
+        if t:
+            xy, good = follow(gray[t - 1], image, xy)
+            col, row = xy.round().astype(int).T.clip(0)
+            good &= free[t][row.clip(0, image.shape[0] - 1), col.clip(0, image.shape[1] - 1)]
+            xy, ids = xy[good], ids[good]
+        if len(xy) < 0.8 * corners:
+            room = free[t].astype(np.uint8) * 255
+            for x, y in xy:
+                cv2.circle(room, (int(x), int(y)), int(distance), 0, -1)
+            new = cv2.goodFeaturesToTrack(image, corners - len(xy), 0.005, distance, mask=room)
+            if new is not None:
+                xy = np.concatenate([xy, new[:, 0]])
+                ids = np.concatenate([ids, count + np.arange(len(new))])
+                count += len(new)
+        seen.append((np.full(len(xy), t), ids.copy(), xy.copy()))
+        progress((t + 1) / len(gray))
+    return Tracks(*(np.concatenate(column) for column in zip(*seen, strict=True)))

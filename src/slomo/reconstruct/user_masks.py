@@ -1,0 +1,79 @@
+"""Segmenter that takes the masks which the user made."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from slomo.errors import InvalidData
+from slomo.reconstruct.flow import Flow
+from slomo.reconstruct.segment import Masks, Report, no_subject
+
+_SUFFIXES = (".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg", ".webp")
+
+
+@dataclass(frozen=True)
+class UserMasks:
+    """A folder of pictures, one a frame in the order of their names, of any size (non-zero is the subject), or an npz
+    with `packed` (T, H, ceil(W/8)) as of `np.packbits` and `shape` (T, H, W). A folder that holds one npz counts as it.
+    """
+
+    path: Path
+    name: str = "user"
+
+    def segment(self, frames: np.ndarray, flow: Flow, progress: Report) -> Masks:
+        path = Path(self.path)
+        if path.is_dir():
+            files = sorted(f for f in path.iterdir() if f.suffix.lower() in (*_SUFFIXES, ".npz"))
+            archives = [f for f in files if f.suffix.lower() == ".npz"]
+            if len(archives) == 1:
+                masks = _from_archive(archives[0])
+            else:
+                masks = [_from_picture(f) for f in files if f.suffix.lower() in _SUFFIXES]
+        else:
+            masks = _from_archive(path)
+        if len(masks) != len(frames):
+            raise InvalidData(
+                f"holds {len(masks)} masks, the decoded clip has {len(frames)} frames",
+                where=path,
+                todo="give one mask for each decoded frame (see start, duration and fps of decode)",
+            )
+        height, width = frames.shape[1:3]
+        out = np.zeros(frames.shape[:3], bool)
+        for i, mask in enumerate(masks):
+            given = mask.shape[1] / mask.shape[0]
+            if abs(given / (width / height) - 1.0) > 0.03:
+                raise InvalidData(
+                    f"mask {i} is {mask.shape[1]}x{mask.shape[0]}, the frames are {width}x{height}",
+                    where=path,
+                    todo="give masks with the frames' proportions",
+                )
+            out[i] = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
+            progress((i + 1) / len(masks))
+        if not out.any():
+            raise no_subject(f"all masks in {path} are empty")
+        return Masks(out)
+
+
+def _from_archive(path: Path) -> np.ndarray:
+    try:
+        with np.load(path, allow_pickle=False) as z:
+            shape = tuple(int(n) for n in z["shape"])
+            masks = np.unpackbits(z["packed"], axis=-1)[..., : shape[2]].astype(bool)
+    except (OSError, ValueError, KeyError, IndexError, TypeError, EOFError) as error:
+        raise InvalidData(
+            f"cannot be read as masks ({error})", where=path, todo="give an npz with arrays packed and shape"
+        ) from None
+    if masks.shape != shape:
+        raise InvalidData(f"packed holds {masks.shape}, shape says {shape}", where=path)
+    return masks
+
+
+def _from_picture(path: Path) -> np.ndarray:
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if picture is None:
+        raise InvalidData("not a readable picture", where=path, todo="give masks as PNG")
+    if picture.ndim == 3 and picture.shape[2] == 4 and not picture[..., 3].all():
+        return picture[..., 3] > 0  # drawn on transparency
+    return picture[..., :3].any(-1) if picture.ndim == 3 else picture > 0

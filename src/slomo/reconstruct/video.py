@@ -1,0 +1,203 @@
+"""Decoding a clip into upright RGB frames on a uniform time grid."""
+
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import av
+import av.error
+import numpy as np
+
+from slomo.errors import InvalidData
+
+MIN_FRAMES = 8
+_DIAGONAL_35MM = 43.267  # mm, diagonal of the full frame that "35 mm equivalent" focal lengths refer to
+_FOCAL_TAG = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A decoded clip.
+
+    Attributes:
+        frames: (T, H, W, 3) uint8 RGB, upright.
+        t: (T,) s, uniform, from the first frame kept.
+        info: what `video.json` holds.
+    """
+
+    frames: np.ndarray
+    t: np.ndarray
+    info: dict
+
+
+def decode(
+    path: Path,
+    *,
+    start: float = 0.0,
+    duration: float = 0.0,
+    fps: float = 30.0,
+    max_side: int = 640,
+    max_frames: int = 900,
+    progress=lambda fraction: None,
+) -> Clip:
+    """Decode `path`, resampling to at most `fps` by the nearest source frame and shrinking to `max_side` px.
+
+    Args:
+        start: s from the clip's first frame.
+        duration: s; 0 means up to the end.
+        fps: upper bound of the frame rate; a slower source keeps its own.
+        max_frames: bound on memory; the rest of a longer clip is dropped and `info["frames_dropped"]` says how much.
+
+    Raises:
+        InvalidData: the file is no video, holds no frame in the wanted span, or fewer than 8.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InvalidData("no such file", where=path, todo="give a video file")
+    if path.stat().st_size == 0:
+        raise InvalidData("the file is empty", where=path, todo="give a video file")
+    pts, stamps_lost = _timestamps(path)
+    if len(pts) == 0:
+        raise InvalidData(
+            "the video stream holds no frames", where=path, todo="copy the clip again, it may be truncated"
+        )
+    source_fps = 1.0 / float(np.median(np.diff(pts))) if len(pts) > 1 else 0.0
+    rate = min(source_fps, fps)
+    length = float(pts[-1] - pts[0]) + (1.0 / source_fps if source_fps else 0.0)
+    stop = min(length, start + duration) if duration > 0 else length
+    wanted = int(np.floor((stop - start) * rate + 1e-6)) if stop > start else 0
+    _require_enough(wanted, path, f"the clip lasts {length:.2f} s, {max(stop - start, 0):.2f} s of it were asked for")
+    dropped = max(0, wanted - max_frames)
+    grid = start + np.arange(wanted - dropped) / rate
+
+    with closing(_open(path)) as container:
+        stream = container.streams.video[0]
+        info = _stream_info(container, stream)
+        if start > 1.0:  # land on the key frame before the start
+            container.seek(int((float(pts[0]) + start - 0.5) / stream.time_base), stream=stream)
+        aspect = float(stream.sample_aspect_ratio or 0) or 1.0
+        stack, count, rotation = _fill(grid, _frames(stream, float(pts[0])), 1.0 / rate, aspect, max_side, progress)
+    _require_enough(count, path, f"only {count} frames could be decoded")
+    lost = stamps_lost + len(grid) - count
+    stack = stack[:count]
+    info |= {
+        "fps": rate,
+        "source_fps": source_fps,
+        "width": int(stack.shape[2]),
+        "height": int(stack.shape[1]),
+        "rotation": rotation,
+        "frames_total": len(stack),
+        "frames_lost": int(lost),
+        "frames_dropped": dropped,
+        "start_s": start,
+        "scale": float(max(stack.shape[1:3]) / max(info["source_width"], info["source_height"])),
+    }
+    if info["focal_35mm"]:
+        info["focal_px_hint"] = info["focal_35mm"] / _DIAGONAL_35MM * float(np.hypot(*stack.shape[1:3]))
+    return Clip(stack, np.arange(len(stack)) / rate, info)
+
+
+def _require_enough(count: int, path: Path, why: str) -> None:
+    if count < MIN_FRAMES:
+        raise InvalidData(
+            f"too short: {why}", where=path, todo=f"give at least {MIN_FRAMES} frames, better two seconds or more"
+        )
+
+
+def _open(path: Path):
+    try:
+        container = av.open(str(path))
+    except (av.error.FFmpegError, ValueError) as error:
+        raise InvalidData(
+            f"not a readable video ({getattr(error, 'strerror', None) or error})",
+            where=path,
+            todo="give a video file (mp4, mov, webm, mkv, avi...); a file cut off while copying has to be copied again",
+        ) from None
+    if not container.streams.video:
+        container.close()
+        raise InvalidData("has no video stream", where=path, todo="give a video file")
+    return container
+
+
+def _timestamps(path: Path) -> tuple[np.ndarray, int]:
+    """Presentation times of all packets (s, sorted), without decoding, and how many frames the header promises more."""
+    with closing(_open(path)) as container:
+        stream = container.streams.video[0]
+        stamps = []
+        try:
+            for packet in container.demux(stream):
+                stamp = packet.pts if packet.pts is not None else packet.dts
+                if packet.size and stamp is not None and not packet.is_corrupt:
+                    stamps.append(float(stamp * stream.time_base))
+        except av.error.FFmpegError:
+            pass  # what follows the damage cannot be read; the frames before it can
+        return np.unique(stamps), max(0, stream.frames - len(stamps))
+
+
+def _frames(stream, origin: float) -> Iterator[tuple[float, av.VideoFrame]]:
+    """Decoded frames with their time (s from the clip's first frame); damaged packets are skipped."""
+    last = -np.inf
+    try:
+        for packet in stream.container.demux(stream):
+            try:
+                frames = packet.decode()
+            except av.error.InvalidDataError:
+                continue
+            for frame in frames:
+                time = frame.time - origin if frame.time is not None else last + 1.0 / float(stream.average_rate or 30)
+                if time > last and not frame.is_corrupt:
+                    last = time
+                    yield time, frame
+    except av.error.FFmpegError:
+        return
+
+
+def _stream_info(container, stream) -> dict:
+    tags = {**container.metadata, **stream.metadata}
+    try:
+        focal = float(tags.get(_FOCAL_TAG, 0.0))
+    except ValueError:
+        focal = 0.0
+    return {
+        "codec": stream.codec_context.name,
+        "source_width": stream.width,
+        "source_height": stream.height,
+        "focal_35mm": focal,
+    }
+
+
+def _fill(grid, frames, step: float, aspect: float, max_side: int, progress) -> tuple[np.ndarray, int, int]:
+    """The source frame nearest to each grid time, how many grid times got one, and the rotation applied (degrees)."""
+    stack, count, rotation = np.zeros((0, 0, 0, 3), np.uint8), 0, 0
+    previous: tuple[float, av.VideoFrame] | None = None
+
+    def take_until(limit: float):
+        nonlocal stack, count, rotation
+        rgb = None
+        while previous and count < len(grid) and grid[count] <= limit:
+            rgb = _to_rgb(previous[1], aspect, max_side) if rgb is None else rgb
+            if not count:
+                stack, rotation = np.empty((len(grid), *rgb.shape), np.uint8), int(previous[1].rotation) % 360
+            stack[count] = rgb
+            count += 1
+            progress(count / len(grid))
+
+    for time, frame in frames:
+        take_until(0.5 * (previous[0] + time) if previous else -1.0)
+        previous = (time, frame)
+        if count == len(grid):
+            break
+    if previous:  # the last frame stands for the time until the next one would have come
+        take_until(previous[0] + 0.999 * step)
+    return stack, count, rotation
+
+
+def _to_rgb(frame: av.VideoFrame, aspect: float, max_side: int) -> np.ndarray:
+    """(H, W, 3) uint8, square pixels, long side at most `max_side`, upright."""
+    width, height = frame.width * aspect, float(frame.height)
+    scale = min(1.0, max_side / max(width, height))
+    # Even sizes keep video encoders of the later stages content.
+    width, height = (max(2, 2 * round(side * scale / 2)) for side in (width, height))
+    rgb = frame.reformat(width=width, height=height, format="rgb24", interpolation="AREA").to_ndarray()
+    return np.ascontiguousarray(np.rot90(rgb, round(frame.rotation / 90) % 4))
