@@ -1,0 +1,240 @@
+"""The fit, coarse to fine: size and trunk with headings, then gaits with the legs, then the rivals, then the winner alone.
+
+Every phase is one `optimise` of a batch of hypotheses; between phases they are ranked by loss on fixed draws and the best go
+on. All of it is deterministic by the seed, and a checkpoint within any phase resumes to the same bits.
+"""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+import torch
+
+from slomo.reconstruct import hypotheses
+from slomo.reconstruct.hypotheses import GaitHypothesis, RootGuess
+from slomo.reconstruct.problem import Draw, Problem, Schedule, Variables, optimise
+from slomo.reconstruct.trajectory import Guess
+from slomo.stage import Progress
+
+Tensor = torch.Tensor
+
+PHASES = ("heading", "gait", "rivals", "final")
+
+
+@dataclass
+class Run:
+    """Where a fit stands; all of it is in a checkpoint.
+
+    Attributes:
+        phase: index into PHASES. x, guess: of its H hypotheses. labels: what each hypothesis is.
+        log: what was decided so far, for the report.
+    """
+
+    phase: int
+    x: Variables
+    guess: Guess
+    labels: list[dict]
+    log: dict = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much work each phase does (`FitConfig` says it in the user's terms)."""
+
+    schedules: tuple[Schedule, ...]
+    candidates: int
+    phases_of_gait: int
+
+
+def fit(problem: Problem, root: RootGuess, effort: Effort, *, metres: float, seed: int, progress: Progress) -> Run:
+    """Fit from the root path to the winner.
+
+    Args:
+        metres: wanted body length m, for Froude numbers.
+        seed: of the draws and of the MLPs' first layers.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    run, start, adam_state = _restore(progress.load(), generator)
+    if run is None:
+        guess, names = hypotheses.heading_guess(problem.kin, root, len(problem.obs.t))
+        x = problem.variables(len(names), generator)
+        x["shape.log_length"] += math.log(root.length)
+        run = Run(0, x, guess, [{"heading": n} for n in names])
+    total = sum(s.iterations * _cost(s) for s in effort.schedules)
+    while True:
+        schedule = effort.schedules[run.phase]
+        done = sum(s.iterations * _cost(s) for s in effort.schedules[: run.phase])
+
+        def each(i: int, optimiser: torch.optim.Adam, loss: Tensor, run=run, schedule=schedule, done=done) -> None:
+            fraction = (done + i * _cost(schedule)) / total
+            progress.update(fraction, f"{PHASES[run.phase]} {i}/{schedule.iterations}, loss {float(loss.min()):.3f}")
+            if progress.checkpoint_due():
+                progress.save(_arrays(run, i, optimiser, generator))
+
+        run.x = optimise(
+            problem, run.x, run.guess, schedule, generator, start=start, adam_state=adam_state, each=each
+        )  # fmt: skip
+        start, adam_state = 0, None
+        losses = rank(problem, run.x, run.guess)
+        run.log[PHASES[run.phase]] = [
+            label | {"loss": round(float(v), 4)} for label, v in zip(run.labels, losses, strict=True)
+        ]
+        if run.phase == len(PHASES) - 1:
+            return run
+        run = (_to_gait, _to_rivals, _to_final)[run.phase](problem, run, losses, root, effort, metres, progress)
+
+
+def _cost(schedule: Schedule) -> float:
+    return schedule.frames * schedule.pixels + 2000
+
+
+def rank(
+    problem: Problem, x: Variables, guess: Guess, *, draws: int = 4, frames: int = 32, pixels: int = 256
+) -> Tensor:
+    """(H,) loss on draws that are the same for every call."""
+    generator = torch.Generator().manual_seed(7)
+    with torch.no_grad():
+        parts = [problem.loss(x, guess, problem.draw(frames, pixels, generator))[0] for _ in range(draws)]
+    return torch.stack(parts).mean(0)
+
+
+def _pick(x: Variables, which: Tensor) -> Variables:
+    return {k: v[which].clone() for k, v in x.items()}
+
+
+def _to_gait(
+    problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, metres: float, progress: Progress
+) -> Run:
+    """Lay gaits over the best heading (two when they are close), rank them as they are, keep the best few and "no gait"."""
+    order = losses.argsort()
+    keep = [int(order[0])]
+    keep += [int(k) for k in order[1:2] if losses[k] < 1.15 * losses[order[0]]]
+    skeleton, kin, obs = problem.kin.skeleton, problem.kin, problem.obs
+    rest = skeleton.rest()
+    leg = float(np.mean([rest[limb.swing, 2] - rest[limb.contact, 2] for limb in skeleton.limbs]))
+    speed = float(np.median(root.speed))
+    grid = hypotheses.gait_grid(obs, skeleton, leg=leg * metres, speed=speed * metres, phases=effort.phases_of_gait)
+    run.log["stride_candidates_hz"] = sorted({round(g.frequency, 3) for g in grid})
+    t = obs.t.numpy()
+    entries: list[tuple[float, int, GaitHypothesis, Guess]] = []
+    gaits = {g.name: g for g in skeleton.gaits}
+    for k in keep:
+        one = torch.tensor([k])
+        base = run.guess.pick(one)
+        for i in range(0, len(grid), 24):
+            chunk = grid[i : i + 24]
+            poses = [hypotheses.gait_pose(kin, gaits[g.name], g, t, speed=root.speed, leg=leg) for g in chunk]
+            guess = _lay(base, poses)
+            value = rank(problem, _pick(run.x, one.expand(len(chunk))), guess, draws=1, frames=20, pixels=160)
+            entries += [
+                (float(v), k, g, guess.pick(torch.tensor([n])))
+                for n, (v, g) in enumerate(zip(value, chunk, strict=True))
+            ]
+            progress.update(0.02 + 0.05 * i / len(grid), f"trying {len(grid)} gaits")
+    entries.sort(key=lambda e: e[0])
+    chosen = _diverse(entries, effort.candidates - len(keep))
+    which = torch.tensor([k for k in keep] + [k for _, k, _, _ in chosen])
+    guesses = [run.guess.pick(torch.tensor([k])) for k in keep] + [g for *_, g in chosen]
+    labels = [run.labels[k] | {"gait": "none"} for k in keep]
+    labels += [
+        run.labels[k] | {"gait": g.name, "stride_hz": round(g.frequency, 3), "phase": round(g.phase, 3)}
+        for _, k, g, _ in chosen
+    ]
+    return Run(1, _pick(run.x, which), _join(guesses), labels, run.log)
+
+
+def _lay(base: Guess, poses: list[tuple[np.ndarray, np.ndarray]]) -> Guess:
+    f = lambda x: torch.as_tensor(np.stack(x), dtype=torch.float32)  # noqa: E731
+    n = len(poses)
+    wide = base.pick(torch.zeros(n, dtype=torch.long))
+    return replace(wide, q=base.q + f([q for q, _ in poses]), stance=f([c for _, c in poses]))
+
+
+def _join(guesses: list[Guess]) -> Guess:
+    return Guess(**{f.name: torch.cat([getattr(g, f.name) for g in guesses]) for f in fields(Guess)})
+
+
+def _diverse(entries: list, count: int) -> list:
+    """The best entries that differ: in gait, in phase by a sixth, in frequency by a fifth, or in heading; and the best
+    one's left-right opposite, so that a swap of the legs is always weighed against it."""
+
+    def far(a: GaitHypothesis, b: GaitHypothesis) -> bool:
+        turn = abs((a.phase - b.phase + 0.5) % 1.0 - 0.5)
+        return a.name != b.name or turn > 1 / 6.5 or abs(math.log(a.frequency / b.frequency)) > 0.15
+
+    out: list = []
+    for e in entries:
+        if len(out) == count:
+            break
+        if all(e[1] != o[1] or far(e[2], o[2]) for o in out):
+            out.append(e)
+    if out:
+        best = out[0]
+        opposite = [
+            e for e in entries
+            if e[1] == best[1] and e[2].name == best[2].name and e[2].frequency == best[2].frequency
+            and abs(abs(e[2].phase - best[2].phase) - 0.5) < 1e-6
+        ]  # fmt: skip
+        if opposite and all(o is not opposite[0] for o in out):
+            out[-1 if len(out) == count else len(out) :] = opposite
+    return out
+
+
+def _to_rivals(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
+    """The two best go on."""
+    which = losses.argsort()[:2]
+    return Run(2, _pick(run.x, which), run.guess.pick(which), [run.labels[int(k)] for k in which], run.log)
+
+
+def _to_final(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
+    which = losses.argsort()[:1]
+    return Run(3, _pick(run.x, which), run.guess.pick(which), [run.labels[int(which)]], run.log)
+
+
+def swap_margin(log: dict) -> float | None:
+    """Relative loss by which the chosen gait beats its left-right opposite after the short fits; None without a gait."""
+    chosen = log["final"][0]
+    if chosen.get("gait", "none") == "none":
+        return None
+    own = next(e for e in log["gait"] if all(e.get(k) == chosen[k] for k in ("heading", "gait", "stride_hz", "phase")))
+    other = [
+        e["loss"] for e in log["gait"]
+        if e["gait"] == own["gait"] and abs(abs(e["phase"] - own["phase"]) - 0.5) < 0.13
+        and abs(e["stride_hz"] / own["stride_hz"] - 1) < 0.15
+    ]  # fmt: skip
+    return round(min(other) / own["loss"] - 1, 4) if other else None
+
+
+def _arrays(run: Run, iteration: int, optimiser: torch.optim.Adam, generator: torch.Generator) -> dict[str, np.ndarray]:
+    """A checkpoint."""
+    out = {f"x.{k}": v.detach().numpy().copy() for k, v in run.x.items()}
+    out |= {f"guess.{f.name}": getattr(run.guess, f.name).numpy() for f in fields(Guess)}
+    for n, s in optimiser.state_dict()["state"].items():
+        out |= {f"adam.{n}.{k}": v.numpy().copy() for k, v in s.items()}
+    meta = dict(phase=run.phase, iteration=iteration, labels=run.labels, log=run.log)
+    out["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
+    out["rng"] = generator.get_state().numpy()
+    return out
+
+
+def _restore(saved: "Callable | dict | None", generator: torch.Generator) -> tuple[Run | None, int, dict | None]:
+    """Run, iteration and Adam's moments from a checkpoint; the generator is set to where it was."""
+    if saved is None:
+        return None, 0, None
+    z = {k: np.array(v) for k, v in saved.items()}  # type: ignore[union-attr]
+    tensor = lambda a: torch.from_numpy(a.copy())  # noqa: E731
+    meta = json.loads(bytes(z["meta"]))
+    x = {k[2:]: tensor(v) for k, v in z.items() if k.startswith("x.")}
+    guess = Guess(**{f.name: tensor(z[f"guess.{f.name}"]) for f in fields(Guess)})
+    generator.set_state(tensor(z["rng"]))
+    state: dict[int, dict] = {}
+    for k, v in z.items():
+        if k.startswith("adam."):
+            _, n, name = k.split(".")
+            state.setdefault(int(n), {})[name] = tensor(v)
+    return Run(meta["phase"], x, guess, meta["labels"], meta["log"]), meta["iteration"], state
+
+
+__all__ = ["Draw", "Effort", "Run", "fit", "rank", "swap_margin"]

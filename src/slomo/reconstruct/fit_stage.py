@@ -1,0 +1,140 @@
+"""The fit as a stage: artifacts of decode, masks and camera in, metric key points and a report out."""
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from slomo.errors import UsageError
+from slomo.reconstruct import fit as fitting
+from slomo.reconstruct import hypotheses
+from slomo.reconstruct.kinematics import Kinematics, Posed
+from slomo.reconstruct.observations import Observations, observe
+from slomo.reconstruct.outcome import Outcome, assess
+from slomo.reconstruct.problem import Problem, Schedule
+from slomo.reconstruct.trajectory import Trajectory
+from slomo.skeleton import Skeleton, load_skeleton
+from slomo.stage import Artifact, Inputs, Progress
+
+FIT_VERSION = 1
+
+# Two shapes of random place overlap at about 0.3, the rest pose at the right place at 0.5 to 0.6; a fit that is right has
+# 0.75 and more. Below this the key points do not follow the subject.
+MIN_IOU = 0.45
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Parameters of the fit.
+
+    Attributes:
+        skeleton: "quadruped", "human" or the path of a TOML file.
+        length_m: m, withers to tail base of a quadruped or standing height of a human; 0 takes the skeleton's typical length.
+        seed: of every random choice.
+        fps: fit frames a second at most. subject_px: size of the subject in working pixels (root of its area).
+        width: neurons of the hidden layers of Q and G. joint_hz, root_hz: highest frequency of their time features.
+        iterations: of the heading, gait, rivals and final phase.
+        candidates: hypotheses that are fitted in the gait phase; gait_phases: phases tried of each gait.
+        tilt_moving_deg, tilt_static_deg: s.d. of the given gravity for a camera that moved, and for one that did not.
+        weight_*: of the evidence; 0 switches a term off.
+    """
+
+    skeleton: str = "quadruped"
+    length_m: float = 0.0
+    seed: int = 0
+    fps: float = 15.0
+    subject_px: float = 42.0
+    width: int = 64
+    joint_hz: float = 4.0
+    root_hz: float = 2.5
+    iterations: tuple[int, ...] = (100, 120, 150, 700)
+    candidates: int = 8
+    gait_phases: int = 12
+    tilt_moving_deg: float = 0.7
+    tilt_static_deg: float = 4.0
+    weight_mask: float = 1.0
+    weight_reach: float = 0.6
+    weight_flow: float = 0.6
+    weight_stance: float = 0.3
+    weight_ground: float = 0.3
+    weight_limits: float = 0.05
+    weight_smooth: float = 0.02
+    weight_forward: float = 0.05
+    weight_prior: float = 0.05
+
+    def __post_init__(self):
+        if self.length_m < 0:
+            raise UsageError("must be 0 (typical) or a length in m", where="length_m", valid=["0", "0.2 ... 3"])
+        if len(self.iterations) != len(fitting.PHASES):
+            raise UsageError("needs one number for each phase", where="iterations", valid=fitting.PHASES)
+
+    def weights(self) -> dict[str, float]:
+        return {k.removeprefix("weight_"): v for k, v in vars(self).items() if k.startswith("weight_")}
+
+
+def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
+    """Fit the skeleton to masks and flow.
+
+    Reads the artifacts "decode" (frames.npz: t), "masks" (masks.npz, flow.npz) and "camera" (camera.npz, report.json), and
+    the file "skeleton" where the configuration names a path.
+
+    Returns:
+        keypoints.npz and report.json; `failure` is set when the body hardly overlaps the masks.
+    """
+    began, cpu = time.perf_counter(), time.process_time()
+    skeleton = load_skeleton(inputs.files.get("skeleton", config.skeleton))
+    decode, masks, camera = (inputs.artifacts[k] for k in ("decode", "masks", "camera"))
+    mode = camera.json["report.json"]["mode"]
+    t = np.asarray(decode.npz["frames.npz"]["t"], float)
+    obs = observe(
+        t, masks.npz["masks.npz"], masks.npz["flow.npz"], camera.npz["camera.npz"],
+        fps=config.fps, subject_px=config.subject_px,
+    )  # fmt: skip
+    kin = Kinematics(skeleton)
+    path = Trajectory(obs.t, kin.B, joint_hz=config.joint_hz, root_hz=config.root_hz, width=config.width)
+    spread = np.radians(config.tilt_moving_deg if mode == "moving" else config.tilt_static_deg)
+    problem = Problem(obs, kin, path, config.weights(), float(spread))
+    root = hypotheses.root_guess(obs, skeleton)
+    metres = config.length_m or skeleton.typical_length
+    run = fitting.fit(problem, root, _effort(config), metres=metres, seed=config.seed, progress=progress)
+    outcome = assess(problem, run, metres)
+    source = "length_m" if config.length_m else f"typical length of {skeleton.name}"
+    progress.note(f"size: {metres:g} m from {source}; the video alone does not tell it")
+    report: dict[str, Any] = outcome.report | {
+        "skeleton": skeleton.name, "camera_mode": mode, "length_m": metres, "scale_source": source,
+        "seconds": round(time.perf_counter() - began, 1), "cpu_seconds": round(time.process_time() - cpu, 1),
+    }  # fmt: skip
+    arrays = _arrays(obs, skeleton, outcome, masks.npz["masks.npz"], camera.npz["camera.npz"]["K"])
+    iou = report["silhouette_iou"]
+    failure = None
+    if iou < MIN_IOU:
+        failure = f"the fitted body covers the subject badly (IoU {iou:.2f}, needs {MIN_IOU}); look at the masks"
+    return Artifact(npz={"keypoints.npz": arrays}, json={"report.json": report}, failure=failure)
+
+
+def _effort(config: FitConfig) -> fitting.Effort:
+    heading, gait, rivals, final = config.iterations
+    return fitting.Effort(
+        schedules=(
+            Schedule(heading, 12, 160, ("G", "shape.log_length", "shape.group", "shape.girth")),
+            Schedule(gait, 16, 160, ("Q", "G", "shape", "tilt"), stance=1.0),
+            Schedule(rivals, 32, 200, ("Q", "G", "shape", "tilt"), stance=0.0),
+            Schedule(final, 48, 300, ("Q", "G", "shape", "tilt")),
+        ),
+        candidates=config.candidates,
+        phases_of_gait=config.gait_phases,
+    )
+
+
+def _arrays(obs: Observations, skeleton: Skeleton, o: Outcome, masks: Any, K: np.ndarray) -> dict[str, np.ndarray]:
+    return dict(
+        t=obs.t.numpy().astype(float), keypoints=o.keypoints, keypoint_names=np.array(o.names),
+        confidence=o.confidence, contact=o.contact,
+        contact_names=np.array([skeleton.names[c] for c in skeleton.contacts]),
+        K=np.asarray(K, float), T_world_cam=o.T_world_cam, packed=masks["packed"], shape=masks["shape"],
+    )  # fmt: skip
+
+
+__all__ = ["FIT_VERSION", "FitConfig", "Posed", "run_fit", "torch"]

@@ -1,0 +1,194 @@
+"""Guesses to start from: the root path from the masks and the ground, headings, and gaits with frequency and phase."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from slomo.reconstruct.kinematics import Kinematics
+from slomo.reconstruct.observations import Observations, ground_points
+from slomo.reconstruct.trajectory import Guess
+from slomo.skeleton import Gait, Skeleton
+
+Array = np.ndarray
+GRAVITY = 9.81
+
+
+@dataclass(frozen=True)
+class GaitHypothesis:
+    """A gait with stride frequency Hz and phase in [0, 1) of the first limb's cycle at t = 0; name "none" has no cycle."""
+
+    name: str
+    frequency: float = 0.0
+    phase: float = 0.0
+
+
+def whittaker(y: Array, weight: Array, smoothness: float) -> Array:
+    """(T, D) smoothed y (T, D): weighted least squares with squared second differences (Whittaker 1923), reweighted to
+    be robust (Cauchy, three rounds). `smoothness` in frames is about the half width of the kernel."""
+    T = len(y)
+    D = np.diff(np.eye(T), 2, axis=0)
+    penalty = smoothness**4 * D.T @ D + 1e-9 * np.eye(T)
+    w = weight.astype(float)
+    for _ in range(4):
+        x = np.linalg.solve(np.diag(w) + penalty, w[:, None] * y)
+        r = np.linalg.norm(y - x, axis=1)
+        scale = 2.0 * max(np.median(r[weight > 0.1]) if (weight > 0.1).any() else 0.0, 1e-9)
+        w = weight / (1 + (r / scale) ** 2)
+    return x
+
+
+@dataclass(frozen=True)
+class RootGuess:
+    """Coarse path of the subject: middle of the body on the ground (T, 2), body length, heading of travel (T,) rad, distance
+    travelled in body lengths; world units."""
+
+    middle: Array
+    length: float
+    heading: Array
+    travelled: float
+    speed: Array
+
+
+def root_guess(obs: Observations, skeleton: Skeleton) -> RootGuess:
+    """Depth from the lowest mask row on the ground, size from the box's height: both hold when the animal turns."""
+    at, K = obs.at.numpy(), obs.K
+    u0, v0, u1, v1 = obs.box.T
+    whole = (v1 < K.height - 2) & ~obs.empty
+    centred = (u0 > 0) & (u1 < K.width - 1)
+    ground = np.array([ground_points(K, obs.T_world_cam[k], np.array((a + b) / 2), np.array(c + 0.5))
+                       for k, a, b, c in zip(at, u0, u1, v1, strict=True)])  # fmt: skip
+    known = np.isfinite(ground).all(1) & ~obs.empty
+    if not known.any():
+        # Feet never below the horizon: no depth from the ground; put the subject at twice the camera's height.
+        mid = np.stack([obs.T_world_cam[at, 0, 3] + 4 * obs.T_world_cam[at, 0, 2],
+                        obs.T_world_cam[at, 1, 3] + 4 * obs.T_world_cam[at, 1, 2]], 1)  # fmt: skip
+        ground = np.concatenate([mid, np.zeros((len(mid), 1))], 1)
+        known = ~obs.empty
+    weight = known * obs.quality.numpy() * np.where(whole, 1.0, 0.02) * np.where(centred, 1.0, 0.1)
+    near = np.linalg.norm(ground - obs.T_world_cam[at, :3, 3], axis=1)
+    weight = weight * np.where(near < 30 * np.median(near[known]), 1.0, 0.0) + 1e-4 * known
+    fps = 1 / float(obs.dt.median())
+    path = whittaker(np.where(known[:, None], ground[:, :2], 0.0), weight, 0.25 * fps)
+    # Size of an upright thing of box height at that depth.
+    cam = obs.T_world_cam[at]
+    depth = np.einsum("fi,fi->f", np.concatenate([path, np.zeros((len(path), 1))], 1) - cam[:, :3, 3], cam[:, :3, 2])
+    level = np.linalg.norm(cam[:, :2, 2], axis=1).clip(0.3)
+    tall = (v1 - v0 + 1) * depth / K.fy / level
+    usable = whole & known & (v0 > 0)
+    rest = skeleton.rest()[:, 2]
+    height = skeleton.root_height + np.quantile(rest, 0.95) + (0.03 if skeleton.kind == "human" else 0.08)
+    length = float(np.median(tall[usable if usable.any() else known])) / height
+    t = obs.t.numpy()
+    full = np.stack([np.interp(t, t[at], path[:, i]) for i in range(2)], 1)
+    v = np.gradient(full, t, axis=0)
+    step = max(1, round(0.15 * len(t) / max(t[-1] - t[0], 1e-6)))
+    v = np.stack([np.convolve(np.pad(v[:, i], step, "edge"), np.ones(2 * step + 1) / (2 * step + 1), "valid")
+                  for i in range(2)], 1)  # fmt: skip
+    speed = np.linalg.norm(v, axis=1)
+    # Where the subject hardly moves the direction is taken from the times when it does.
+    slow = 0.25 * length
+    w = (speed / slow) ** 2 / (1 + (speed / slow) ** 2) + 1e-3
+    unit = whittaker(v / np.maximum(speed, 1e-9)[:, None], w, 0.3 * len(t) / max(t[-1] - t[0], 1e-6))
+    heading = np.unwrap(np.arctan2(unit[:, 1], unit[:, 0]))
+    travelled = float(np.linalg.norm(full[-1] - full[0])) / length
+    return RootGuess(full, length, heading, travelled, speed / length)
+
+
+def heading_guess(kin: Kinematics, root: RootGuess, T: int) -> tuple[Guess, list[str]]:
+    """Rest poses along the path: facing the way of travel, and facing eight fixed ways."""
+    yaws, names = [], []
+    if root.travelled > 0.7:
+        for turn in (0.0, -30.0, 30.0, 180.0):
+            yaws.append(root.heading + math.radians(turn))
+            names.append(f"travel{turn:+.0f}")
+    if root.travelled < 2.0:
+        for n in range(8):
+            yaws.append(np.full(T, n * math.pi / 4))
+            names.append(f"{n * 45}")
+    yaw = np.stack(yaws)
+    s = kin.skeleton
+    middle = float(s.rest()[: s.link_count, 0].mean()) if s.kind == "quadruped" else 0.0
+    ahead = np.stack([np.cos(yaw), np.sin(yaw)], -1)
+    xy = root.middle - middle * root.length * ahead
+    z = np.full((*yaw.shape, 1), s.root_height * root.length)
+    f = lambda x: torch.as_tensor(x, dtype=torch.float32)  # noqa: E731
+    H = len(names)
+    q = torch.zeros(H, T, kin.B, 3)
+    stance = torch.full((H, T, len(s.limbs)), -1.0)
+    return Guess(position=f(np.concatenate([xy, z], -1)), yaw=f(yaw), q=q, stance=stance), names
+
+
+def stride_frequencies(obs: Observations, low: float, high: float) -> list[float]:
+    """Candidate stride frequencies Hz from the self-similarity of the leg band, most likely first.
+
+    Masks are cut to their box's lower half; the mean difference between frames a lag apart dips at the stride period, and
+    about as deep at half of it where left and right look alike: both readings of each dip are candidates.
+    """
+    import cv2
+
+    dt = float(obs.dt.median())
+    K = obs.K
+    bands = []
+    for m, (u0, v0, u1, v1), empty in zip(obs.mask.numpy(), obs.box, obs.empty, strict=True):
+        full = m.reshape(K.height, K.width)
+        crop = full[int((v0 + v1) / 2) : int(v1) + 1, int(u0) : int(u1) + 1]
+        bands.append(np.zeros((16, 48)) if empty or not crop.size else
+                     cv2.resize(crop.astype(np.float32), (48, 16), interpolation=cv2.INTER_AREA))  # fmt: skip
+    x = np.stack(bands)
+    F = len(x)
+    lags = np.arange(1, max(2, int(0.75 * F)))
+    d = np.array([np.abs(x[k:] - x[:-k]).mean() for k in lags])
+    trend = np.convolve(np.pad(d, 8, "edge"), np.ones(17) / 17, "valid")
+    dips = [i for i in range(1, len(d) - 1) if d[i] <= d[i - 1] and d[i] < d[i + 1]]
+    dips.sort(key=lambda i: d[i] - trend[i])
+    out: list[float] = []
+    for i in dips[:2]:
+        c = d[i - 1] - 2 * d[i] + d[i + 1]
+        lag = lags[i] + (0.5 * (d[i - 1] - d[i + 1]) / c if c > 0 else 0.0)
+        for f in (1 / (lag * dt), 0.5 / (lag * dt)):
+            if low <= f <= high and all(abs(f / g - 1) > 0.06 for g in out):
+                out.append(float(f))
+    return out
+
+
+def gait_grid(obs: Observations, skeleton: Skeleton, *, leg: float, speed: float, phases: int) -> list[GaitHypothesis]:
+    """All gaits that fit the speed, with the clip's stride frequencies and `phases` phases each.
+
+    Args:
+        leg: leg length m. speed: median speed m/s. Both metric, for the Froude number and the range of frequencies.
+    """
+    natural = math.sqrt(GRAVITY / leg) / (2 * math.pi)
+    froude = speed**2 / (GRAVITY * leg)
+    frequencies = stride_frequencies(obs, 0.5 * natural, 5.5 * natural)
+    out = []
+    for gait in skeleton.gaits:
+        # Speed is uncertain (scale, path): a factor of two each way in the Froude number.
+        if not gait.froude[0] / 2 <= froude <= gait.froude[1] * 2:
+            continue
+        for f in frequencies[:3]:
+            for stretch in (0.95, 1.0, 1.05):
+                out += [GaitHypothesis(gait.name, f * stretch, n / phases) for n in range(phases)]
+    return out
+
+
+def gait_pose(
+    kin: Kinematics, gait: Gait, hypothesis: GaitHypothesis, t: Array, *, speed: Array, leg: float
+) -> tuple[Array, Array]:
+    """Joint angles (T, B, 3) and contacts (T, L) of a gait. speed (T,) and leg in body lengths (and s)."""
+    q = np.zeros((len(t), kin.B, 3))
+    contact = np.zeros((len(t), len(kin.skeleton.limbs)))
+    stroke = speed * gait.duty / hypothesis.frequency
+    amplitude = np.arctan2(stroke / 2, leg).clip(math.radians(4), math.radians(38))
+    for n, (limb, land) in enumerate(zip(kin.skeleton.limbs, gait.land, strict=True)):
+        c = (hypothesis.frequency * (t - t[0]) + hypothesis.phase - land) % 1.0
+        swing = ((c - gait.duty) / (1 - gait.duty)).clip(0, 1)
+        # Stance: from forward (negative y) to back at constant speed; swing: back to front along a cosine.
+        along = np.where(c < gait.duty, 2 * c / gait.duty - 1, np.cos(math.pi * swing))
+        q[:, limb.swing, 1] = amplitude * along
+        lift = np.sin(math.pi * swing) * (c >= gait.duty)
+        for joint, angle in limb.lift:
+            q[:, joint, 1] = angle * lift * np.minimum(1, amplitude / math.radians(15))
+        contact[:, n] = c < gait.duty
+    return q, contact

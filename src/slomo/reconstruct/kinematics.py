@@ -1,0 +1,130 @@
+"""Forward kinematics of a skeleton in torch, for H hypotheses and T times at once.
+
+Shape variables are unit normals: each is multiplied by the spread of what it changes, so that the prior is their square.
+"""
+
+from dataclasses import dataclass
+
+import torch
+
+from slomo.skeleton import Skeleton
+
+Tensor = torch.Tensor
+
+NODE_SPREAD = 0.08  # s.d. of the log length of one offset, beside its group's
+SHIFT_SPREAD = 0.025  # s.d. of the place of a node, body lengths
+RADIUS_SPREAD = 0.18  # s.d. of the log radius of one capsule
+GIRTH_SPREAD = 0.15  # s.d. of the log of all radii together
+
+
+@dataclass(frozen=True)
+class Posed:
+    """The posed body, world frame, world units.
+
+    Attributes:
+        nodes: (H, T, M, 3). R: (H, T, B, 3, 3) link to world.
+        a, b: (H, T, C, 3) ends of the capsules. radii: (H, C, 2) at a and b.
+        length: (H,) body length.
+    """
+
+    nodes: Tensor
+    R: Tensor
+    a: Tensor
+    b: Tensor
+    radii: Tensor
+    length: Tensor
+
+
+def rot(axis: int, angle: Tensor) -> Tensor:
+    """(..., 3, 3) rotation by `angle` (...,) rad about x, y or z (0, 1, 2)."""
+    c, s = torch.cos(angle), torch.sin(angle)
+    zero, one = torch.zeros_like(c), torch.ones_like(c)
+    if axis == 0:
+        rows = (one, zero, zero, zero, c, -s, zero, s, c)
+    elif axis == 1:
+        rows = (c, zero, s, zero, one, zero, -s, zero, c)
+    else:
+        rows = (c, -s, zero, s, c, zero, zero, zero, one)
+    return torch.stack(rows, -1).reshape(*angle.shape, 3, 3)
+
+
+def joint_rotation(q: Tensor) -> Tensor:
+    """(..., 3, 3) of joint angles (..., 3) about x (abduction), y (flexion), z (twist): Ry Rx Rz, written out."""
+    (cx, cy, cz), (sx, sy, sz) = torch.cos(q).unbind(-1), torch.sin(q).unbind(-1)
+    rows = (
+        cy * cz + sy * sx * sz, sy * sx * cz - cy * sz, sy * cx,
+        cx * sz, cx * cz, -sx,
+        cy * sx * sz - sy * cz, sy * sz + cy * sx * cz, cy * cx,
+    )  # fmt: skip
+    return torch.stack(rows, -1).reshape(*q.shape[:-1], 3, 3)
+
+
+class Kinematics:
+    """A skeleton's tables as tensors, and its forward kinematics."""
+
+    def __init__(self, skeleton: Skeleton):
+        self.skeleton = skeleton
+        self.B = skeleton.link_count
+        f = lambda x: torch.as_tensor(x, dtype=torch.float32)  # noqa: E731
+        i = lambda x: torch.as_tensor(x, dtype=torch.long)  # noqa: E731
+        self.link, self.offset, self.mirror = i(skeleton.link), f(skeleton.offset), i(skeleton.mirror)
+        self.group, self.group_spread = i(skeleton.group).clamp(min=0), f(skeleton.group_spread)
+        self.lower, self.upper, self.sigma = f(skeleton.lower), f(skeleton.upper), f(skeleton.sigma)
+        self.c_link, self.c_nodes = i(skeleton.capsule_link), i(skeleton.capsule_nodes)
+        self.c_shift, self.c_radii = f(skeleton.capsule_shift), f(skeleton.capsule_radii)
+        self.c_own = self.c_nodes == self.c_link[:, None]
+        # Left and right share the variable of the first of the two; y is mirrored for the other.
+        first = torch.minimum(self.mirror, torch.arange(len(self.mirror)))
+        self.node_variable = torch.unique(first, return_inverse=True)[1]
+        self.flip = torch.where(first < torch.arange(len(first)), -1.0, 1.0)
+        self.median = (self.mirror == torch.arange(len(first))).float()
+        c_first = torch.minimum(i(skeleton.capsule_mirror), torch.arange(len(self.c_link)))
+        self.radius_variable = torch.unique(c_first, return_inverse=True)[1]
+        depth = [0]
+        for j in range(1, self.B):
+            depth.append(depth[int(self.link[j])] + 1)
+        self.levels = [i([j for j in range(self.B) if depth[j] == d]) for d in range(1, max(depth) + 1)]
+        self.contacts = i(list(skeleton.contacts))
+
+    def shape_variables(self, H: int) -> dict[str, Tensor]:
+        """Zeros of every shape variable: the skeleton as written, one unit long."""
+        n, c = int(self.node_variable.max()) + 1, int(self.radius_variable.max()) + 1
+        sizes = dict(log_length=(), group=(len(self.group_spread),), node=(n,), shift=(n, 3), radius=(c,), girth=())
+        return {k: torch.zeros(H, *s) for k, s in sizes.items()}
+
+    def offsets(self, shape: dict[str, Tensor]) -> Tensor:
+        """(H, M, 3) node offsets in their links, world units."""
+        log = (shape["group"] * self.group_spread)[:, self.group] + NODE_SPREAD * shape["node"][:, self.node_variable]
+        shift = SHIFT_SPREAD * shape["shift"][:, self.node_variable]
+        side = torch.stack([torch.ones_like(self.flip), self.flip * (1 - self.median), torch.ones_like(self.flip)], -1)
+        offset = self.offset * log.exp()[..., None] + shift * side
+        offset = torch.cat([torch.zeros_like(offset[:, :1]), offset[:, 1:]], 1)
+        return offset * shape["log_length"].exp()[:, None, None]
+
+    def pose(self, shape: dict[str, Tensor], position: Tensor, R_root: Tensor, q: Tensor) -> Posed:
+        """Forward kinematics. position (H, T, 3), R_root (H, T, 3, 3), q (H, T, B, 3) rad with an unused root row."""
+        H, T = position.shape[:2]
+        offset = self.offsets(shape)
+        local = joint_rotation(q)
+        R: list[Tensor] = [R_root] * self.B
+        p: list[Tensor] = [position] * self.B
+        for level in self.levels:
+            parents = [int(self.link[j]) for j in level]
+            Rp = torch.stack([R[k] for k in parents], 2)
+            pp = torch.stack([p[k] for k in parents], 2)
+            Rl = Rp @ local[:, :, level]
+            pl = pp + (Rp @ offset[:, None, level, :, None])[..., 0]
+            for n, j in enumerate(level.tolist()):
+                R[j], p[j] = Rl[:, :, n], pl[:, :, n]
+        Rs, ps = torch.stack(R, 2), torch.stack(p, 2)
+        points = self.link[self.B :]
+        tips = ps[:, :, points] + (Rs[:, :, points] @ offset[:, None, self.B :, :, None])[..., 0]
+        length = shape["log_length"].exp()
+        # Ends of the capsules in their link: nothing for the link's own node, the offset for a node fixed to it.
+        ends = torch.where(self.c_own[None, :, :, None], torch.zeros(1), offset[:, self.c_nodes])
+        ends = ends + self.c_shift * length[:, None, None, None]
+        Rc, pc = Rs[:, :, self.c_link], ps[:, :, self.c_link]
+        ab = pc[:, :, :, None] + (Rc[:, :, :, None] @ ends[:, None, ..., None])[..., 0]
+        log_r = GIRTH_SPREAD * shape["girth"][:, None] + RADIUS_SPREAD * shape["radius"][:, self.radius_variable]
+        radii = self.c_radii * (log_r.exp() * length[:, None])[..., None]
+        return Posed(torch.cat([ps, tips], 2), Rs, ab[..., 0, :], ab[..., 1, :], radii, length.expand(H))

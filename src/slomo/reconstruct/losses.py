@@ -1,0 +1,236 @@
+"""Evidence: what the posed body is compared with, as a list of terms with one signature.
+
+A term maps a `State` (the posed body, its projection, the draw of pixels) to one number per hypothesis, dimensionless and of
+order one when the pose is off by a limb's width. A learned prior, a neural field or a physics roll-out is another term.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+from slomo.reconstruct import silhouette
+from slomo.reconstruct.kinematics import Kinematics, Posed
+from slomo.reconstruct.observations import Observations
+from slomo.reconstruct.silhouette import Outline
+
+Tensor = torch.Tensor
+
+SOFT_PX = 0.7  # width of the silhouette's edge and of the smooth minimum over capsules, working pixels
+FLOW_PX = 0.25  # flow errors below this are noise, working pixels
+
+
+@dataclass(frozen=True)
+class State:
+    """One evaluation of H hypotheses.
+
+    Attributes:
+        body: posed at the F fit frames. q: (H, F, B, 3). R_root: (H, F, 3, 3).
+        shape: the unit-normal shape variables. tilt: (H, 2) unit-normal camera tilt.
+        R_cam, centre: (H, F, 3, 3) world to camera, (H, F, 3).
+        seen: frames drawn for image terms (S,), as positions among the fit frames; u, v: (S, P) px, the first `inside` of
+            the P pixels lie in the mask. out: outline of the capsules there; sd, h: (H, S, P, C).
+        ends: camera-frame capsule ends (H, F, C, 3) a and b.
+        stance: (H, F-1, L) hypothetical contact times its present weight; negative where there is no hypothesis.
+    """
+
+    obs: Observations
+    kin: Kinematics
+    body: Posed
+    q: Tensor
+    R_root: Tensor
+    shape: dict[str, Tensor]
+    tilt: Tensor
+    R_cam: Tensor
+    centre: Tensor
+    seen: Tensor
+    u: Tensor
+    v: Tensor
+    pixel: Tensor
+    inside: int
+    out: Outline
+    sd: Tensor
+    h: Tensor
+    ends: tuple[Tensor, Tensor]
+    stance: Tensor
+
+
+Term = Callable[[State], Tensor]
+
+
+def _frame_mean(s: State, x: Tensor, weight: Tensor) -> Tensor:
+    """(H,) mean over drawn frames and pixels of x (H, S, P) with weight (S, P) or (H, S, P), by mask quality."""
+    w = weight * s.obs.quality[s.seen][:, None]
+    return (x * w).sum((1, 2)) / (w.sum((-1, -2)) + 1e-6)
+
+
+def mask(s: State) -> Tensor:
+    """Soft occupancy against the mask, mask and background weighted alike, over the whole frame."""
+    near = silhouette.soft_min(s.sd, SOFT_PX)
+    empty = torch.sigmoid(near / SOFT_PX)
+    n = s.inside
+    one = torch.ones_like(s.u)
+    miss = _frame_mean(s, empty[:, :, :n], one[:, :n])
+    extra = _frame_mean(s, 1 - empty[:, :, n:], one[:, n:])
+    return miss + extra
+
+
+def reach(s: State) -> Tensor:
+    """How far mask pixels are from the body, and bones from the mask: gradients from afar, in units of 5 px."""
+    n = s.inside
+    near = s.sd[:, :, :n].amin(-1).clamp(min=0) / 5.0
+    unexplained = _frame_mean(s, torch.sqrt(near**2 + 0.01) - 0.1, torch.ones_like(s.u[:, :n]))
+    o, K = s.out, s.obs.K
+    edge = s.obs.edge[s.seen]
+    x = torch.cat([o.ua, o.ub, (o.ua + o.ub) / 2], -1) * (2 / (K.width - 1)) - 1
+    y = torch.cat([o.va, o.vb, (o.va + o.vb) / 2], -1) * (2 / (K.height - 1)) - 1
+    r = torch.cat([o.ra, o.rb, (o.ra + o.rb) / 2], -1)
+    H, S, N = x.shape
+    grid = torch.stack([x, y], -1).permute(1, 0, 2, 3).reshape(S, H * N, 1, 2)
+    away = torch.nn.functional.grid_sample(edge, grid, padding_mode="border", align_corners=True)
+    away = away.reshape(S, H, N).permute(1, 0, 2)
+    # A bone's axis lies its radius inside; outside the picture nothing is known.
+    shown = ((x.abs() < 1) & (y.abs() < 1)).float() * s.obs.quality[s.seen][:, None]
+    over = (away + 0.6 * r).clamp(min=0) / 5.0
+    outside = ((torch.sqrt(over**2 + 0.01) - 0.1) * shown).sum((1, 2)) / (shown.sum((1, 2)) + 1e-6)
+    return unexplained + outside
+
+
+def flow(s: State) -> Tensor:
+    """Optical flow: the surface point that a mask pixel sees moves with its link to the next fit frame."""
+    obs, K = s.obs, s.obs.K
+    pairs = s.seen < len(obs.at) - 1
+    k = s.seen[pairs]
+    u, v, pixel = s.u[pairs][:, : s.inside], s.v[pairs][:, : s.inside], s.pixel[pairs][:, : s.inside]
+    sub = Outline(**{f: getattr(s.out, f)[:, pairs] for f in Outline.__dataclass_fields__})
+    c, meets = silhouette.visible(K, sub, s.sd[:, pairs][:, :, : s.inside], s.h[:, pairs][:, :, : s.inside])
+    X = silhouette.surface(K, sub, c, u, v)
+    predicted = carry(s, k, c, X) - torch.stack([u, v], -1)
+    observed = torch.stack([obs.flow[i][p] for i, p in zip(k.tolist(), pixel, strict=True)])
+    fine = torch.stack([obs.flow_ok[i][p] for i, p in zip(k.tolist(), pixel, strict=True)]).float()
+    error = torch.sqrt(((predicted - observed) ** 2).sum(-1) + FLOW_PX**2) - FLOW_PX
+    # Robust: wrong flow at occlusions must not pull; saturates at about the flow's own size.
+    size = 2.0 + obs.flow_size
+    w = fine * meets.float() * obs.quality[k][:, None]
+    e = size * (1 - torch.exp(-error / size))
+    return (e * w).sum((1, 2)) / (w.sum((1, 2)) + 0.2 * w[0].numel() / 4) / (1.0 + 0.25 * obs.flow_size)
+
+
+def carry(s: State, k: Tensor, c: Tensor, X: Tensor) -> Tensor:
+    """(H, S, P, 2) px where camera-frame points X of frames k, fixed to capsules c, are seen in frames k + 1."""
+    kin, body = s.kin, s.body
+    H, S, P = c.shape
+    # Camera of frame k -> link -> camera of frame k + 1, composed per capsule before it is gathered per pixel.
+    R0 = s.R_cam[:, k][:, :, None] @ body.R[:, k][:, :, kin.c_link]
+    R1 = s.R_cam[:, k + 1][:, :, None] @ body.R[:, k + 1][:, :, kin.c_link]
+    R = R1 @ R0.transpose(-1, -2)
+    a0, a1 = s.ends[0][:, k], s.ends[0][:, k + 1]
+    p = a1 - (R @ a0[..., None])[..., 0]
+    Rg = torch.gather(R.reshape(H, S, -1, 9), 2, c[..., None].expand(H, S, P, 9)).reshape(H, S, P, 3, 3)
+    pg = torch.gather(p, 2, c[..., None].expand(H, S, P, 3))
+    Y = (Rg @ X[..., None])[..., 0] + pg
+    u, v, _ = silhouette.project(s.obs.K, Y)
+    return torch.stack([u, v], -1)
+
+
+def feet(s: State) -> tuple[Tensor, Tensor, Tensor]:
+    """Height above their stance height (H, F, L), and velocity to the next fit frame (H, F-1, L, 3), in body lengths (and s)."""
+    L = s.body.length[:, None, None]
+    x = s.body.nodes[:, :, s.kin.contacts]
+    height = x[..., 2] / L - s.kin.skeleton.sole
+    return height, (x[:, 1:] - x[:, :-1]) / L[..., None] / s.obs.dt[:, None, None], x
+
+
+def contact_weight(s: State) -> Tensor:
+    """(H, F-1, L) how surely a foot stands from one fit frame to the next; not differentiated.
+
+    From its height and speed in the present fit, from whether its pixels move with the ground, and from the gait
+    hypothesis as long as that has weight.
+    """
+    with torch.no_grad():
+        height, velocity, x = feet(s)
+        low = torch.sigmoid((0.10 - torch.maximum(height[:, 1:], height[:, :-1])) / 0.03)
+        L = s.body.length[:, None]
+        root = s.body.nodes[:, :, 0]
+        travel = (root[:, 1:] - root[:, :-1]).norm(dim=-1) / L / s.obs.dt
+        limit = 0.35 + 0.45 * travel[..., None]
+        slow = torch.sigmoid((limit - velocity[..., :2].norm(dim=-1)) / (0.25 * limit))
+        X = silhouette.to_camera(s.R_cam, s.centre, x)
+        u, v, _ = silhouette.project(s.obs.K, X)
+        K = s.obs.K
+        grid = torch.stack([u * (2 / (K.width - 1)) - 1, v * (2 / (K.height - 1)) - 1], -1)[:, :-1]
+        H, F1, N = grid.shape[:3]
+        still = torch.nn.functional.grid_sample(
+            s.obs.static[:-1], grid.permute(1, 0, 2, 3).reshape(F1, H * N, 1, 2), align_corners=True
+        )
+        still = still.reshape(F1, H, N).permute(1, 0, 2)
+        own = low * slow * (0.4 + 0.6 * still)
+        return torch.where(s.stance < 0, own, torch.maximum(own, s.stance))
+
+
+def stance(s: State) -> Tensor:
+    """A foot that stands stays where it is, on the ground."""
+    height, velocity, _ = feet(s)
+    w = contact_weight(s)
+    drift = (velocity[..., :2] * s.obs.dt[:, None, None] / 0.05).square().sum(-1)
+    lift = ((height[:, 1:] / 0.04).square() + (height[:, :-1] / 0.04).square()) / 2
+    both = drift / (1 + drift).detach().sqrt() + lift / (1 + lift).detach().sqrt()
+    return (w * both).sum((1, 2)) / both[0].numel()
+
+
+def ground(s: State) -> Tensor:
+    """Nothing is below the ground, and the lowest foot is near it."""
+    height, _, _ = feet(s)
+    below = (-height).clamp(min=0) / 0.03
+    z = s.body.nodes[..., 2] / s.body.length[:, None, None]
+    sunk = (0.02 - z).clamp(min=0) / 0.03
+    lowest = soft_lowest(height) / 0.06
+    return below.square().mean((1, 2)) + sunk.square().mean((1, 2)) + 0.3 * (torch.sqrt(lowest**2 + 1) - 1).mean(1)
+
+
+def soft_lowest(height: Tensor) -> Tensor:
+    """(H, F) smooth minimum over the feet."""
+    return -0.02 * torch.logsumexp(height / -0.02, -1)
+
+
+def limits(s: State) -> Tensor:
+    """Joint angles within their anatomical ranges, and near rest by their prior; root pitch and roll small."""
+    q, kin = s.q[:, :, 1:], s.kin
+    over = (q - kin.upper[1:]).clamp(min=0) + (kin.lower[1:] - q).clamp(min=0)
+    rest = (q / kin.sigma[1:]).square()
+    up = s.R_root[..., 2, 0].square() / 0.15**2 + s.R_root[..., 2, 1].square() / 0.08**2
+    return 40 * over.square().sum(-1).mean((1, 2)) + 0.3 * rest.mean((1, 2, 3)) + 0.15 * up.mean(1)
+
+
+def forward(s: State) -> Tensor:
+    """Animals and people move mostly the way they face: sideways and backward speed, saturating, in half body lengths / s."""
+    p, L = s.body.nodes[:, :, 0, :2], s.body.length[:, None, None]
+    v = (p[:, 1:] - p[:, :-1]) / L / s.obs.dt[:, None]
+    ahead = s.R_root[:, :-1, :2, 0]
+    along = (v * ahead).sum(-1)
+    across = v[..., 1] * ahead[..., 0] - v[..., 0] * ahead[..., 1]
+    e = (across.square() + 0.5 * along.clamp(max=0).square()) / 0.25
+    return (e / (1 + 0.3 * e)).mean(1)
+
+
+def smooth(s: State) -> Tensor:
+    """Accelerations of all nodes, and of the root twice, in units of 15 body lengths / s^2."""
+    x = s.body.nodes
+    if x.shape[1] < 3:
+        return x.new_zeros(len(x))
+    dt = s.obs.dt
+    v = (x[:, 1:] - x[:, :-1]) / dt[:, None, None]
+    a = (v[:, 1:] - v[:, :-1]) / (0.5 * (dt[1:] + dt[:-1]))[:, None, None] / s.body.length[:, None, None, None]
+    return ((a / 15).square().sum(-1).mean(2) + (a[:, :, 0] / 8).square().sum(-1)).mean(1)
+
+
+def prior(s: State) -> Tensor:
+    """Shape and camera tilt near what is known before."""
+    z = [v.reshape(len(v), -1) for k, v in s.shape.items() if k != "log_length"]
+    return torch.cat([*z, s.tilt * 3], 1).square().sum(1) / 40
+
+
+TERMS: dict[str, Term] = {
+    "mask": mask, "reach": reach, "flow": flow, "stance": stance, "ground": ground, "limits": limits, "smooth": smooth,
+    "forward": forward, "prior": prior,
+}  # fmt: skip

@@ -1,0 +1,176 @@
+"""What the fit compares with: masks, distance transforms, chained flow and cameras, at a working resolution.
+
+Fit frames are every `step`-th frame of the clip; the flow between two of them is the flow of the frames between, chained.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+
+from slomo.errors import InvalidData
+from slomo.reconstruct.silhouette import Intrinsics
+
+Array = np.ndarray
+Tensor = torch.Tensor
+
+STATIC_PX = 0.35  # a pixel moves with the ground when its flow differs by about this many working pixels
+
+
+@dataclass(frozen=True)
+class Observations:
+    """At F fit frames, images flattened to n = height * width working pixels.
+
+    Attributes:
+        t: (T,) s of all frames; at: (F,) indices of the fit frames; dt: (F-1,) s between them.
+        K: intrinsics of the working resolution; scale: its pixels per decoded pixel.
+        T_world_cam: (T, 4, 4) as given.
+        mask: (F, n) bool; edge: (F, 1, h, w) px, signed distance to the mask's edge, positive outside.
+        draw_in, draw_out: (F, n) cumulative probabilities for drawing mask and background pixels.
+        flow: (F-1, n, 2) px; flow_ok: (F-1, n) bool.
+        static: (F, 1, h, w) in [0, 1], how surely a mask pixel moves as a point of the ground there would.
+        quality: (F,) in [0, 1]. box: (F, 4) u0, v0, u1, v1 px of the mask; empty: (F,) bool.
+        flow_size: px, robust magnitude of the flow inside the mask.
+    """
+
+    t: Tensor
+    at: Tensor
+    dt: Tensor
+    K: Intrinsics
+    scale: float
+    T_world_cam: Array
+    mask: Tensor
+    edge: Tensor
+    draw_in: Tensor
+    draw_out: Tensor
+    flow: Tensor
+    flow_ok: Tensor
+    static: Tensor
+    quality: Tensor
+    box: Array
+    empty: Array
+    flow_size: float
+
+
+def unpack(packed: Array, shape: Array) -> Array:
+    """(T, H, W) bool of bits packed along the last axis."""
+    return np.unpackbits(packed, axis=-1)[..., : int(shape[-1])].astype(bool)
+
+
+def observe(
+    frames_t: Array, masks: Mapping[str, Array], flow: Mapping[str, Array], camera: Mapping[str, Array],
+    *, fps: float, subject_px: float,
+) -> Observations:  # fmt: skip
+    """Arrange the artifacts for the fit.
+
+    Args:
+        frames_t: (T,) s. masks, flow, camera: the arrays of the upstream artifacts.
+        fps: fit frames a second at most.
+        subject_px: wanted size of the subject (root of its area) in working pixels; never above the clip's own.
+
+    Raises:
+        InvalidData: the artifacts disagree about the number of frames, or no frame has a subject.
+    """
+    T, height, width = (int(n) for n in masks["shape"])
+    counts = dict(frames=len(frames_t), masks=T, flow=len(flow["flow"]) + 1, camera=len(camera["T_world_cam"]))
+    if len(set(counts.values())) != 1:
+        raise InvalidData(f"the parts disagree about the number of frames: {counts}", where="reconstruct")
+    rate = (T - 1) / max(float(frames_t[-1] - frames_t[0]), 1e-9)
+    step = max(1, round(rate / fps))
+    if T <= 2 * step:
+        step = 1
+    at = np.arange(0, T, step)
+    full = unpack(masks["packed"][at], masks["shape"])
+    area = full.sum((1, 2))
+    if not (area > 0).any():
+        raise InvalidData("no frame shows the subject", where="masks", todo="give masks with --masks")
+    scale = min(1.0, subject_px / float(np.sqrt(np.median(area[area > 0]))))
+    w, h = max(16, round(width * scale)), max(16, round(height * scale))
+    scale = w / width
+    mask = np.stack([cv2.resize(m.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA) > 0.5 for m in full])
+    K0 = np.asarray(camera["K"], float)
+    # Pixel centres are at integers: (u + 1/2) scales, not u.
+    K = Intrinsics(
+        K0[0, 0] * scale, K0[1, 1] * scale, (K0[0, 2] + 0.5) * scale - 0.5, (K0[1, 2] + 0.5) * scale - 0.5, w, h
+    )
+    fl, ok = _chain(flow, at, width)
+    fl = np.stack([cv2.resize(f, (w, h), interpolation=cv2.INTER_AREA) for f in fl]) * scale
+    ok = np.stack([cv2.resize(o.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA) > 0.7 for o in ok])
+    T_world_cam = np.asarray(camera["T_world_cam"], float)
+    static = _static(K, T_world_cam[at], mask, fl, ok)
+    inside = np.stack([cv2.distanceTransform(m.astype(np.uint8), cv2.DIST_L2, 3) for m in mask])
+    outside = np.stack(
+        [cv2.distanceTransform((~m).astype(np.uint8), cv2.DIST_L2, 3) if m.any() else np.zeros((h, w)) for m in mask]
+    )
+    empty = ~mask.any((1, 2))
+    box = np.array([[0, 0, 0, 0] if not m.any() else _box(m) for m in mask], float)
+    # Thin parts (legs) are drawn as often as thick ones; background is drawn near the subject and everywhere.
+    draw_in = _cumulative(np.where(mask, 1 / (1 + inside), 0))
+    near = np.where(mask, 0, np.exp(-outside / 4.0))
+    far = (~mask).astype(float)
+    total = lambda x: np.maximum(x.sum((1, 2), keepdims=True), 1e-9)  # noqa: E731
+    draw_out = _cumulative(0.65 * near / total(near) + 0.35 * far / total(far))
+    size = np.linalg.norm(fl, axis=-1)[ok & mask[:-1]]
+    f = lambda x: torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)  # noqa: E731
+    flat = lambda x: torch.as_tensor(np.ascontiguousarray(x)).reshape(len(x), h * w, *x.shape[3:])  # noqa: E731
+    return Observations(
+        t=f(frames_t), at=torch.as_tensor(at), dt=f(np.diff(np.asarray(frames_t)[at])), K=K, scale=scale,
+        T_world_cam=T_world_cam, mask=flat(mask), edge=f(outside - inside)[:, None], draw_in=draw_in, draw_out=draw_out,
+        flow=flat(fl.astype(np.float32)), flow_ok=flat(ok & mask[:-1]), static=f(static)[:, None],
+        quality=f(masks["quality"][at]) * f(~empty), box=box, empty=empty,
+        flow_size=float(np.quantile(size, 0.5)) if len(size) else 1.0,
+    )  # fmt: skip
+
+
+def _box(m: Array) -> tuple[int, int, int, int]:
+    u, v = np.flatnonzero(m.any(0)), np.flatnonzero(m.any(1))
+    return u[0], v[0], u[-1], v[-1]
+
+
+def _cumulative(p: Array) -> Tensor:
+    c = np.cumsum(p.reshape(len(p), -1), axis=1)
+    return torch.as_tensor(c / np.maximum(c[:, -1:], 1e-12))
+
+
+def _chain(flow: Mapping[str, Array], at: Array, width: int) -> tuple[Array, Array]:
+    """Flow between consecutive fit frames: each pixel is carried through the frames between. (F-1, H, W, 2), (F-1, H, W)."""
+    out, ok_out = [], []
+    for a, b in zip(at[:-1], at[1:], strict=True):
+        total = np.asarray(flow["flow"][a], np.float32)
+        h, w = total.shape[:2]
+        ok = np.unpackbits(flow["consistent"][a], axis=-1)[:, :width].astype(np.float32)
+        grid = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).astype(np.float32)
+        for k in range(a + 1, b):
+            at_k = grid + total
+            total = total + cv2.remap(np.asarray(flow["flow"][k], np.float32), at_k, None, cv2.INTER_LINEAR)
+            ok_k = np.unpackbits(flow["consistent"][k], axis=-1)[:, :width].astype(np.float32)
+            ok = ok * cv2.remap(ok_k, at_k, None, cv2.INTER_LINEAR)
+        out.append(total)
+        ok_out.append(ok > 0.5)
+    return np.stack(out), np.stack(ok_out)
+
+
+def ground_points(K: Intrinsics, T_world_cam: Array, u: Array, v: Array) -> Array:
+    """World points on z = 0 that pixels u, v see; NaN for pixels that look at or above the horizon."""
+    rays = np.stack([(u - K.cx) / K.fx, (v - K.cy) / K.fy, np.ones_like(u, float)], -1) @ T_world_cam[:3, :3].T
+    down = np.where(rays[..., 2] < -1e-3, rays[..., 2], np.nan)
+    return T_world_cam[:3, 3] + rays * (-T_world_cam[2, 3] / down)[..., None]
+
+
+def _static(K: Intrinsics, T_world_cam: Array, mask: Array, flow: Array, ok: Array) -> Array:
+    """How surely each mask pixel moves with the ground under it; the last fit frame repeats the one before."""
+    F, h, w = mask.shape
+    v, u = np.mgrid[:h, :w].astype(float)
+    out = np.zeros((F, h, w))
+    for i in range(F - 1):
+        X = ground_points(K, T_world_cam[i], u, v)
+        Y = (X - T_world_cam[i + 1, :3, 3]) @ T_world_cam[i + 1, :3, :3]
+        z = np.maximum(Y[..., 2], 1e-6)
+        moved = np.stack([K.fx * Y[..., 0] / z + K.cx - u, K.fy * Y[..., 1] / z + K.cy - v], -1)
+        error = np.linalg.norm(flow[i] - moved, axis=-1)
+        score = np.exp(-((error / STATIC_PX) ** 2) / 2)
+        out[i] = np.where(mask[i] & ok[i] & np.isfinite(error), score, 0)
+    out[-1] = out[-2] if F > 1 else 0
+    return out

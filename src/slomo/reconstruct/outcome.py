@@ -1,0 +1,152 @@
+"""From the fitted variables to metric key points at every frame, contacts, confidence and the figures of the report."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from slomo.reconstruct import fit as fitting
+from slomo.reconstruct import losses, silhouette
+from slomo.reconstruct.kinematics import Posed
+from slomo.reconstruct.problem import Draw, Problem
+
+Array = np.ndarray
+
+STANDS_HEIGHT = 0.06  # body lengths above its stance height at which a foot is as likely up as down
+STANDS_SPEED = 0.6  # body lengths / s, likewise
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """names: N key points; keypoints (T, N, 3) m; confidence (T, N); contact (T, F); T_world_cam (T, 4, 4) m."""
+
+    names: tuple[str, ...]
+    keypoints: Array
+    confidence: Array
+    contact: Array
+    T_world_cam: Array
+    report: dict[str, Any]
+
+
+def assess(problem: Problem, run: fitting.Run, metres: float) -> Outcome:
+    """Evaluate the winner at every frame and scale it so that its body is `metres` long."""
+    obs, kin = problem.obs, problem.kin
+    skeleton = kin.skeleton
+    every = torch.arange(len(obs.t))
+    with torch.no_grad():
+        shape = {k.removeprefix("shape."): v for k, v in run.x.items() if k.startswith("shape.")}
+        position, R, q = problem.path(run.x, run.guess, shape["log_length"].exp(), every)
+        body = kin.pose(shape, position, R, q)
+        R_cam, centre = problem.cameras(run.x["tilt"], every)
+        own = _own_length(problem, shape)
+        per_unit = metres / own
+        nodes = body.nodes[0].numpy().astype(float)
+        contact = _contact(nodes[:, list(skeleton.contacts)], obs.t.numpy(), own, skeleton.sole)
+        iou, error, frame_iou = _overlap(problem, run)
+        confidence = _confidence(problem, body, R_cam, centre, frame_iou)
+        loss, parts = problem.loss(run.x, run.guess, problem.draw(48, 400, torch.Generator().manual_seed(11)))
+    T_world_cam = np.tile(np.eye(4), (len(obs.t), 1, 1))
+    T_world_cam[:, :3, :3] = R_cam[0].transpose(-1, -2).numpy()
+    T_world_cam[:, :3, 3] = centre[0].numpy() * per_unit
+    keep = [m for m, n in enumerate(skeleton.names) if n != "tail_mid"]
+    feet = nodes[:, list(skeleton.contacts)] * per_unit
+    report = {
+        "loss": round(float(loss[0]), 4),
+        "losses": {k: round(float(v[0]), 4) for k, v in parts.items()},
+        "silhouette_iou": round(iou, 4),
+        "flow_residual_px": round(error, 3),
+        "hypothesis": run.labels[0],
+        "swap_margin": fitting.swap_margin(run.log),
+        "margin": _margin(run.log),
+        "search": run.log,
+        "foot_skate_mps": round(_skate(feet, contact, obs.t.numpy()), 4),
+        "metres_per_unit": round(per_unit, 5),
+        "tilt_deg": [round(float(np.degrees(a)), 2) for a in run.x["tilt"][0] * problem.tilt_spread],
+        "fit_frames": len(obs.at),
+        "working_size": [obs.K.width, obs.K.height],
+    }
+    names = tuple(skeleton.names[m] for m in keep)
+    return Outcome(names, nodes[:, keep] * per_unit, confidence[:, keep], contact, T_world_cam, report)
+
+
+def _margin(log: dict) -> float | None:
+    """Relative loss by which the winner beat the runner-up in the rivals phase."""
+    rivals = sorted(e["loss"] for e in log["rivals"])
+    return round(rivals[1] / rivals[0] - 1, 4) if len(rivals) > 1 else None
+
+
+def _own_length(problem: Problem, shape: dict[str, torch.Tensor]) -> float:
+    """Body length of the fitted shape at rest, world units: withers to tail base, or standing height."""
+    skeleton = problem.kin.skeleton
+    offset = problem.kin.offsets(shape)[0].numpy()
+    p = np.zeros_like(offset)
+    for m in range(1, len(p)):
+        p[m] = p[skeleton.link[m]] + offset[m]
+    if skeleton.length_between:
+        a, b = (skeleton.index(n) for n in skeleton.length_between)
+        return float(np.linalg.norm(p[a] - p[b]))
+    sole = skeleton.sole * float(shape["log_length"].exp()[0])
+    return float(p[:, 2].max() - np.mean([p[c, 2] for c in skeleton.contacts]) + sole)
+
+
+def _contact(feet: Array, t: Array, length: float, sole: float) -> Array:
+    """(T, F) probability from height and speed: logistic in each."""
+    height = feet[..., 2] / length - sole
+    v = np.linalg.norm(np.gradient(feet, t, axis=0)[..., :2], axis=-1) / length
+    up = 1 / (1 + np.exp(-(STANDS_HEIGHT - height) / (STANDS_HEIGHT / 4)))
+    return up / (1 + np.exp(-(STANDS_SPEED - v) / (STANDS_SPEED / 4)))
+
+
+def _skate(feet: Array, contact: Array, t: Array) -> float:
+    """Mean horizontal speed m/s of feet while they stand."""
+    v = np.linalg.norm(np.gradient(feet, t, axis=0)[..., :2], axis=-1)
+    stands = contact > 0.5
+    return float(v[stands].mean()) if stands.any() else 0.0
+
+
+def _overlap(problem: Problem, run: fitting.Run) -> tuple[float, float, Array]:
+    """Silhouette IoU over all fit frames, median flow error in decoded pixels, and IoU of each fit frame (F,)."""
+    obs = problem.obs
+    ious, errors = [], []
+    n = obs.mask.shape[1]
+    pixels = torch.arange(n)[None]
+    for f in range(len(obs.at)):
+        inside = torch.nonzero(obs.mask[f])[:, 0][None]
+        state = problem.state(run.x, run.guess, Draw(torch.tensor([f]), pixels, 0), stance_weight=0.0)
+        covered = state.sd[0, 0].amin(-1) < 0
+        union = (covered | obs.mask[f]).sum()
+        ious.append(float((covered & obs.mask[f]).sum() / union) if union and not obs.empty[f] else np.nan)
+        if f == len(obs.at) - 1 or not inside.numel():
+            continue
+        state = problem.state(run.x, run.guess, Draw(torch.tensor([f]), inside, inside.shape[1]), stance_weight=0.0)
+        c, meets = silhouette.visible(obs.K, state.out, state.sd, state.h)
+        X = silhouette.surface(obs.K, state.out, c, state.u, state.v)
+        moved = losses.carry(state, torch.tensor([f]), c, X)[0, 0] - torch.stack([state.u[0], state.v[0]], -1)
+        e = (moved - obs.flow[f][inside[0]]).norm(dim=-1)
+        errors.append(e[obs.flow_ok[f][inside[0]] & meets[0, 0]].numpy() / obs.scale)
+    each = np.array(ious)
+    flow_error = float(np.median(np.concatenate(errors))) if errors and sum(map(len, errors)) else float("nan")
+    return float(np.nanmean(each)), flow_error, each
+
+
+def _confidence(problem: Problem, body: Posed, R_cam: torch.Tensor, centre: torch.Tensor, frame_iou: Array) -> Array:
+    """(T, M) in [0, 1]: mask quality times overlap, less for a node that is hidden or lies outside the mask."""
+    obs = problem.obs
+    T = len(obs.t)
+    u, v, z = silhouette.project(obs.K, silhouette.to_camera(R_cam, centre, body.nodes))
+    a = silhouette.to_camera(R_cam, centre, body.a)
+    b = silhouette.to_camera(R_cam, centre, body.b)
+    o = silhouette.outline(obs.K, a, b, body.radii)
+    sd, h = silhouette.distances(o, u[0], v[0])
+    depth = o.za[:, :, None] + h * (o.zb - o.za)[:, :, None]
+    length = float(body.length[0])
+    # Hidden: some capsule covers the node's pixel well in front of it (its own flesh is within a tenth of the body).
+    hidden = ((sd < 0) & (depth < z[..., None] - 0.12 * length)).any(-1)[0].numpy()
+    near = np.abs(np.arange(T)[:, None] - obs.at.numpy()[None]).argmin(1)
+    grid = torch.stack([u[0] * (2 / (obs.K.width - 1)) - 1, v[0] * (2 / (obs.K.height - 1)) - 1], -1)[:, :, None]
+    edge = torch.nn.functional.grid_sample(obs.edge[near], grid, padding_mode="border", align_corners=True)[:, 0, :, 0]
+    outside = np.clip(edge.numpy() / 4.0, 0, 1)
+    shown = (grid.abs() < 1).all(-1)[..., 0].numpy()
+    frame = obs.quality.numpy()[near] * np.nan_to_num(frame_iou, nan=0.0)[near]
+    return frame[:, None] * np.where(hidden, 0.55, 1.0) * (1 - 0.7 * outside) * np.where(shown, 1.0, 0.3)

@@ -1,0 +1,159 @@
+"""The fitting problem: variables of H hypotheses, the draw of pixels, the weighted sum of the evidence, and Adam."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from slomo.reconstruct import losses, silhouette
+from slomo.reconstruct.kinematics import Kinematics, rot
+from slomo.reconstruct.observations import Observations
+from slomo.reconstruct.trajectory import Guess, Trajectory
+
+Tensor = torch.Tensor
+Variables = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Draw:
+    """Pixels of one evaluation: frames `seen` (S,) among the fit frames, flat indices (S, P), the first `inside` in the mask."""
+
+    seen: Tensor
+    pixel: Tensor
+    inside: int
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Everything that stays while variables change.
+
+    Attributes:
+        weights: of the terms by name; a term whose weight is 0 is not evaluated.
+        tilt_spread: s.d. of the camera's pitch and roll against gravity, rad.
+        terms: the evidence.
+    """
+
+    obs: Observations
+    kin: Kinematics
+    path: Trajectory
+    weights: Mapping[str, float]
+    tilt_spread: float
+    terms: Mapping[str, losses.Term] = field(default_factory=lambda: losses.TERMS)
+
+    def variables(self, H: int, generator: torch.Generator) -> Variables:
+        shape = {f"shape.{k}": v for k, v in self.kin.shape_variables(H).items()}
+        return shape | {"tilt": torch.zeros(H, 2)} | self.path.variables(H, generator)
+
+    def cameras(self, tilt: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+        """World-to-camera rotations (H, T, 3, 3) and centres (H, T, 3) after the world has been tilted about the mean centre."""
+        T = torch.as_tensor(self.obs.T_world_cam[at], dtype=torch.float32)
+        mean = torch.as_tensor(self.obs.T_world_cam[:, :3, 3].mean(0), dtype=torch.float32)
+        # About the mean camera's own right and forward axes, laid level: pitch and roll.
+        ahead = torch.as_tensor(self.obs.T_world_cam[:, :3, 2].mean(0), dtype=torch.float32)
+        level = rot(2, torch.atan2(ahead[1], ahead[0]))
+        angle = tilt * self.tilt_spread
+        R = level @ rot(1, angle[:, 0]) @ rot(0, angle[:, 1]) @ level.T
+        R_world_cam = R[:, None] @ T[:, :3, :3]
+        centre = mean + (R[:, None] @ (T[:, :3, 3] - mean)[..., None])[..., 0]
+        return R_world_cam.transpose(-1, -2), centre
+
+    def draw(self, frames: int, pixels: int, generator: torch.Generator) -> Draw:
+        """Random frames and pixels, half of them in the mask."""
+        F = len(self.obs.at)
+        seen = torch.randperm(F, generator=generator)[: min(frames, F)].sort().values
+        half = pixels // 2
+        r = torch.rand(2, len(seen), half, generator=generator, dtype=torch.float64)
+        n = self.obs.mask.shape[1] - 1
+        inside = torch.searchsorted(self.obs.draw_in[seen], r[0]).clamp(max=n)
+        outside = torch.searchsorted(self.obs.draw_out[seen], r[1]).clamp(max=n)
+        return Draw(seen, torch.cat([inside, outside], 1), half)
+
+    def state(self, x: Variables, guess: Guess, draw: Draw, *, stance_weight: float) -> losses.State:
+        obs, kin = self.obs, self.kin
+        shape = {k.removeprefix("shape."): v for k, v in x.items() if k.startswith("shape.")}
+        length = shape["log_length"].exp()
+        position, R_root, q = self.path(x, guess, length, obs.at)
+        body = kin.pose(shape, position, R_root, q)
+        R_cam, centre = self.cameras(x["tilt"], obs.at)
+        a = silhouette.to_camera(R_cam, centre, body.a)
+        b = silhouette.to_camera(R_cam, centre, body.b)
+        out = silhouette.outline(obs.K, a[:, draw.seen], b[:, draw.seen], body.radii)
+        u = (draw.pixel % obs.K.width).float()
+        v = torch.div(draw.pixel, obs.K.width, rounding_mode="floor").float()
+        sd, h = silhouette.distances(out, u, v)
+        hypothetical = guess.stance[:, obs.at][:, :-1]
+        stance = torch.where(hypothetical < 0, hypothetical, stance_weight * hypothetical)
+        return losses.State(
+            obs=obs, kin=kin, body=body, q=q, R_root=R_root, shape=shape, tilt=x["tilt"], R_cam=R_cam, centre=centre,
+            seen=draw.seen, u=u, v=v, pixel=draw.pixel, inside=draw.inside, out=out, sd=sd, h=h, ends=(a, b),
+            stance=stance,
+        )  # fmt: skip
+
+    def loss(self, x: Variables, guess: Guess, draw: Draw, *, stance_weight: float = 0.0) -> tuple[Tensor, Variables]:
+        """(H,) weighted sum, and each term before weighting."""
+        state = self.state(x, guess, draw, stance_weight=stance_weight)
+        parts = {name: term(state) for name, term in self.terms.items() if self.weights.get(name, 0) > 0}
+        return sum((self.weights[k] * v for k, v in parts.items()), torch.zeros(len(guess.yaw))), parts
+
+
+RATES = {"shape.log_length": 4e-3, "shape": 3e-2, "tilt": 2e-2, "Q": 4e-3, "G": 2e-3}
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """One phase of optimisation: Adam, cosine decay of the rates to a tenth.
+
+    Attributes:
+        iterations; frames and pixels of each draw; learn: prefixes of the variables that change.
+        stance: weight of the hypothetical contacts at the start; it falls to 0 at two thirds.
+        decay: False keeps the rates.
+    """
+
+    iterations: int
+    frames: int
+    pixels: int
+    learn: tuple[str, ...]
+    stance: float = 0.0
+
+
+def rate(name: str) -> float:
+    """Learning rate of a variable by its longest known prefix."""
+    return RATES[max((k for k in RATES if name.startswith(k)), key=len)]
+
+
+def adam(x: Variables, learn: tuple[str, ...]) -> torch.optim.Adam:
+    groups = [
+        {"params": [v.requires_grad_(True)], "lr": rate(k), "rate": rate(k)}
+        for k, v in x.items()
+        if k.startswith(learn)
+    ]
+    return torch.optim.Adam(groups, betas=(0.9, 0.98))
+
+
+def optimise(
+    problem: Problem, x: Variables, guess: Guess, schedule: Schedule, generator: torch.Generator, *,
+    start: int = 0, adam_state: dict | None = None,
+    each: Callable[[int, torch.optim.Adam, Tensor], None] = lambda i, optimiser, loss: None,
+) -> Variables:  # fmt: skip
+    """Run one phase from iteration `start`; `each(iteration, optimiser, loss (H,))` is called before every step but the first.
+
+    Hypotheses share nothing, so the sum of their losses is minimised.
+    """
+    optimiser = adam(x, schedule.learn)
+    if adam_state is not None:
+        optimiser.load_state_dict(adam_state)
+    n = schedule.iterations
+    for i in range(start, n):
+        decay = 0.1 + 0.45 * (1 + np.cos(np.pi * i / n))
+        warm = min(1.0, (i + 1) / 10)
+        for group in optimiser.param_groups:
+            group["lr"] = group["rate"] * decay * warm
+        draw = problem.draw(schedule.frames, schedule.pixels, generator)
+        fade = schedule.stance * max(0.0, 1 - 1.5 * i / n)
+        loss, _ = problem.loss(x, guess, draw, stance_weight=fade)
+        optimiser.zero_grad(set_to_none=True)
+        loss.sum().backward()
+        optimiser.step()
+        each(i + 1, optimiser, loss.detach())
+    return {k: v.detach() for k, v in x.items()}
