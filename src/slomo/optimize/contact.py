@@ -16,10 +16,10 @@ recovers the rigid contact (Stewart and Trinkle 1996, relaxed as in interior-poi
 
 from math import sqrt
 
-from numba import njit
+from slomo.optimize.jit import compiled
 
 
-@njit(cache=True)
+@compiled()
 def contact_force(phi, v, u, m, h, mu, g, kappa, lam):
     """Contact force on a point into lam (3,), N, world.
 
@@ -38,7 +38,7 @@ def contact_force(phi, v, u, m, h, mu, g, kappa, lam):
     lam[0], lam[1], lam[2] = sx * c, sy * c, gamma
 
 
-@njit(cache=True)
+@compiled()
 def contact_derivative(phi, v, u, m, h, mu, g, kappa, lam, D):
     """`contact_force` with D (3, 7), its derivative with respect to (phi, v, u)."""
     a = h * h / m

@@ -6,14 +6,15 @@ in the backward pass (Tassa et al. 2014). A Levenberg-Marquardt term and an l1 m
 descent step. The work is linear in the number of knots.
 """
 
+from math import inf, isfinite
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from slomo.optimize.cost import input_cost, input_derivative, state_cost, state_derivative
-from slomo.optimize.dense import box_qp, solve_lower, solve_upper, transpose_times
+from slomo.optimize.dense import box_qp, copy, solve_lower, solve_upper, transpose_times
 from slomo.optimize.dynamics import linearize, minus, plus, step
+from slomo.optimize.jit import compiled
 
 Array = np.ndarray
 
@@ -65,7 +66,7 @@ class Work(NamedTuple):
         )  # fmt: skip
 
 
-@njit(cache=True)
+@compiled()
 def evaluate(body, task, kappa, it, rho, gap, q1, v1):
     """Cost of an iterate (its lam is written) and the l1 norm of its gaps (N, nx, written)."""
     N = it.us.shape[0]
@@ -81,7 +82,7 @@ def evaluate(body, task, kappa, it, rho, gap, q1, v1):
     return J, total
 
 
-@njit(cache=True)
+@compiled()
 def backward(body, task, kappa, it, rho, reg, free_start, w):
     """Riccati pass about an iterate whose gaps are in w.gap: gains, and the first step w.dx[0]. False: reg too small."""
     N, nu = it.us.shape
@@ -96,10 +97,12 @@ def backward(body, task, kappa, it, rho, reg, free_start, w):
     index, scratch = np.empty(nx, np.int64), np.empty((nx, 1))
     for k in range(N, -1, -1):
         Lx = w.Lx[k]
-        Lx[:] = 0.0
+        for i in range(nx):
+            Lx[i] = 0.0
         if k == N:
             state_derivative(body, task, k, it.qs[k], it.vs[k], it.multiplier[k], rho, Lx, Vxx)
-            Vx[:] = Lx
+            for i in range(nx):
+                Vx[i] = Lx[i]
         else:
             A, B, Lu = w.A[k], w.B[k], w.Lu[k]
             linearize(
@@ -118,7 +121,8 @@ def backward(body, task, kappa, it, rho, reg, free_start, w):
             transpose_times(A, VA, Qxx)
             transpose_times(B, VA, Qux)
             transpose_times(B, VB, Quu)
-            Lu[:] = 0.0
+            for i in range(nu):
+                Lu[i] = 0.0
             input_derivative(body, task, k, it.us[k], w.v1, it.lam[k], A, B, w.D, Lx, Lu, Qxx, Quu, Qux)
             state_derivative(body, task, k, it.qs[k], it.vs[k], it.multiplier[k], rho, Lx, Qxx)
             for i in range(nu):
@@ -133,9 +137,12 @@ def backward(body, task, kappa, it, rho, reg, free_start, w):
                 return False
             # K_free = -Quu_free^-1 Qux_free; V = Qxx - S^T S with S = L^-1 Qux_free.
             K = w.K[k]
-            K[:] = 0.0
+            for i in range(nu):
+                for j in range(nx):
+                    K[i, j] = 0.0
             for i in range(n):
-                S[i] = Qux[index[i]]
+                for j in range(nx):
+                    S[i, j] = Qux[index[i], j]
             solve_lower(L, n, S)
             for i in range(nx):
                 s = Lx[i]
@@ -146,7 +153,7 @@ def backward(body, task, kappa, it, rho, reg, free_start, w):
                 scratch[i, 0] = s
             for i in range(nx):
                 Vx[i] = scratch[i, 0]
-            Vxx[:] = Qxx
+            copy(Qxx, Vxx)
             for m in range(n):
                 for i in range(nx):
                     s = S[m, i]
@@ -162,15 +169,17 @@ def backward(body, task, kappa, it, rho, reg, free_start, w):
                 Vxx[i, j] = Vxx[j, i] = 0.5 * (Vxx[i, j] + Vxx[j, i])
     if free_start:
         # Any start, but with its points not under the ground.
-        lower[:], upper[:] = -np.inf, np.inf
+        for i in range(nx):
+            lower[i], upper[i] = -inf, inf
         for c in range(nu // 3):
             lower[8 + 3 * c] = task.heights[0, c] - it.qs[0, 9 + 3 * c]
         return box_qp(Vxx, Vx, lower, upper, w.dx[0], index, L, scratch) >= 0
-    w.dx[0] = 0.0
+    for i in range(nx):
+        w.dx[0, i] = 0.0
     return True
 
 
-@njit(cache=True)
+@compiled()
 def forward(body, it, w):
     """The full Newton step w.dx, w.du from w.dx[0]; returns the slope of the cost along it."""
     N, nu = it.us.shape
@@ -197,7 +206,7 @@ def forward(body, it, w):
     return slope
 
 
-@njit(cache=True)
+@compiled()
 def solve(body, task, kappa, it, rho, free_start, max_iterations, tolerance, reg, w):
     """Improves an iterate in place, for one kappa and one set of multipliers.
 
@@ -215,15 +224,15 @@ def solve(body, task, kappa, it, rho, free_start, max_iterations, tolerance, reg
     N = it.us.shape[0]
     J, G = evaluate(body, task, kappa, it, rho, w.gap, w.q1, w.v1)
     nu = 0.0
-    if not np.isfinite(J + G):
+    if not isfinite(J + G):
         return NOT_FINITE, 0, J, G, reg
     for iteration in range(max_iterations):
         accepted = False
         for _ in range(12):
-            slope = np.inf
+            slope = inf
             if backward(body, task, kappa, it, rho, reg, free_start, w):
                 slope = forward(body, it, w)
-            if np.isfinite(slope):
+            if isfinite(slope):
                 if G > 1e-12:
                     nu = max(nu, 2.0 * max(slope, 0.0) / G)
                 descent = slope - nu * G
@@ -233,18 +242,22 @@ def solve(body, task, kappa, it, rho, free_start, max_iterations, tolerance, reg
                 for _ in range(8):
                     for k in range(N + 1):
                         plus(it.qs[k], it.vs[k], w.dx[k], alpha, w.trial.qs[k], w.trial.vs[k])
-                        w.trial.multiplier[k] = it.multiplier[k]
+                        copy(it.multiplier[k], w.trial.multiplier[k])
                     for k in range(N):
                         for i in range(it.us.shape[1]):
                             w.trial.us[k, i] = it.us[k, i] + alpha * w.du[k, i]
                     Jt, Gt = evaluate(body, task, kappa, w.trial, rho, w.trial_gap, w.q1, w.v1)
-                    if np.isfinite(Jt + Gt) and Jt + nu * Gt <= J + nu * G + 1e-4 * alpha * descent:
+                    if isfinite(Jt + Gt) and Jt + nu * Gt <= J + nu * G + 1e-4 * alpha * descent:
                         accepted = True
                         break
                     alpha *= 0.5
                 if accepted:
-                    it.qs[:], it.vs[:], it.us[:], it.lam[:] = w.trial.qs, w.trial.vs, w.trial.us, w.trial.lam
-                    w.gap[:] = w.trial_gap
+                    copy(w.trial.qs, it.qs)
+                    copy(w.trial.vs, it.vs)
+                    copy(w.trial.us, it.us)
+                    copy(w.trial_gap, w.gap)
+                    for k in range(N):
+                        copy(w.trial.lam[k], it.lam[k])
                     J, G = Jt, Gt
                     if alpha > 0.4:
                         reg = max(reg / 4.0, 1e-9)
@@ -257,19 +270,29 @@ def solve(body, task, kappa, it, rho, free_start, max_iterations, tolerance, reg
     return ITERATIONS, max_iterations, J, G, reg
 
 
-@njit(cache=True)
+@compiled()
 def close(body, task, kappa, it, w):
     """Roll the iterate out with its feedback gains, so that its dynamics hold to rounding."""
     N, nu = it.us.shape
     d = np.empty(w.dx.shape[1])
-    q, v = it.qs[0].copy(), it.vs[0].copy()
+    q, v = np.empty(it.qs.shape[1]), np.empty(it.vs.shape[1])
+    for i in range(q.shape[0]):
+        q[i] = it.qs[0, i]
+    for i in range(v.shape[0]):
+        v[i] = it.vs[0, i]
     for k in range(N):
         minus(q, v, it.qs[k], it.vs[k], d)
-        it.qs[k], it.vs[k] = q, v
+        for i in range(q.shape[0]):
+            it.qs[k, i] = q[i]
+        for i in range(v.shape[0]):
+            it.vs[k, i] = v[i]
         for i in range(nu):
             s = it.us[k, i]
             for j in range(d.shape[0]):
                 s += w.K[k, i, j] * d[j]
             it.us[k, i] = min(max(s, -body.u_max[i]), body.u_max[i])
         step(body, task.h[k], kappa, task.heights[k + 1], it.qs[k], it.vs[k], it.us[k], q, v, it.lam[k])
-    it.qs[N], it.vs[N] = q, v
+    for i in range(q.shape[0]):
+        it.qs[N, i] = q[i]
+    for i in range(v.shape[0]):
+        it.vs[N, i] = v[i]

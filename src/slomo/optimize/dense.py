@@ -2,11 +2,18 @@
 
 from math import sqrt
 
-import numpy as np
-from numba import njit
+from slomo.optimize.jit import compiled
 
 
-@njit(cache=True)
+@compiled()
+def copy(source, target):
+    """target = source, both (n, m)."""
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
+            target[i, j] = source[i, j]
+
+
+@compiled()
 def transpose_times(A, V, out):
     """out = A^T V, skipping zeros of A: A (n, m), V (n, p), out (m, p)."""
     n, m = A.shape
@@ -22,7 +29,7 @@ def transpose_times(A, V, out):
                     out[i, j] += a * V[k, j]
 
 
-@njit(cache=True)
+@compiled()
 def cholesky(H, index, n, L):
     """L (lower, n x n) of H restricted to index[:n]. False when it is not positive definite."""
     for i in range(n):
@@ -39,7 +46,7 @@ def cholesky(H, index, n, L):
     return True
 
 
-@njit(cache=True)
+@compiled()
 def solve_lower(L, n, X):
     """X (n, p) <- L^-1 X, in place."""
     p = X.shape[1]
@@ -53,7 +60,7 @@ def solve_lower(L, n, X):
             X[i, j] *= a
 
 
-@njit(cache=True)
+@compiled()
 def solve_upper(L, n, X):
     """X (n, p) <- L^-T X, in place."""
     p = X.shape[1]
@@ -67,80 +74,71 @@ def solve_upper(L, n, X):
             X[i, j] *= a
 
 
-@njit(cache=True)
-def box_qp(H, g, lower, upper, x, index, L, work):
+@compiled()
+def _free_set(H, g, lower, upper, x, index, descent):
+    """Number of variables that no bound holds at x; index[:number] are they, descent[:number, 0] minus their gradient."""
+    number = 0
+    for i in range(g.shape[0]):
+        s = g[i]
+        for j in range(g.shape[0]):
+            s += H[i, j] * x[j]
+        if not ((x[i] <= lower[i] and s > 0) or (x[i] >= upper[i] and s < 0)):
+            index[number] = i
+            descent[number, 0] = -s
+            number += 1
+    return number
+
+
+@compiled()
+def box_qp(H, g, lower, upper, x, index, L, d):
     """x = argmin (1/2) x^T H x + g^T x within lower <= x <= upper, by projected Newton steps.
 
     Bertsekas, "Projected Newton methods" (1982), as in Tassa, Mansard, Todorov, "Control-limited differential dynamic
-    programming" (2014), section III-B. H (n, n) positive definite. index (n,) int and work (n, 1) are scratch.
+    programming" (2014), section III-B. H (n, n) positive definite. index (n,) int and d (n, 1) are scratch.
 
     Returns:
         Number of free variables; index[:free] are they and L their factor. -1 when H is not positive definite.
     """
     n = g.shape[0]
+    scale = 0.0
     for i in range(n):
         x[i] = min(max(0.0, lower[i]), upper[i])
-    free = 0
+        scale += g[i] * g[i]
+    free = _free_set(H, g, lower, upper, x, index, d)
     for _ in range(50):
-        free = 0
-        for i in range(n):
-            s = g[i]
-            for j in range(n):
-                s += H[i, j] * x[j]
-            if (x[i] <= lower[i] and s > 0) or (x[i] >= upper[i] and s < 0):
-                continue
-            index[free] = i
-            work[free, 0] = -s
-            free += 1
         if not cholesky(H, index, free, L):
             return -1
-        slope = 0.0
+        squares = 0.0
         for i in range(free):
-            slope += work[i, 0] * work[i, 0]
-        if slope < 1e-24:
-            return free
-        solve_lower(L, free, work[:free])
-        solve_upper(L, free, work[:free])
+            squares += d[i, 0] * d[i, 0]
+        if squares <= 1e-22 * scale:
+            break
+        solve_lower(L, free, d)
+        solve_upper(L, free, d)
+        # Halve the step until the cost falls along the projected arc; inside the bounds the Newton step is the minimum.
         alpha = 1.0
-        inside = False
         for _ in range(30):
-            # Decrease along the projected arc.
             inside = True
-            change = 0.0
-            for i in range(free):
-                y = x[index[i]] + alpha * work[i, 0]
-                if y < lower[index[i]] or y > upper[index[i]]:
-                    inside = False
-            if inside:
-                break
             for i in range(free):
                 a = index[i]
-                di = min(max(x[a] + alpha * work[i, 0], lower[a]), upper[a]) - x[a]
-                s = g[a]
-                for j in range(n):
-                    s += H[a, j] * x[j]
-                for j in range(free):
-                    b = index[j]
-                    s += 0.5 * H[a, b] * (min(max(x[b] + alpha * work[j, 0], lower[b]), upper[b]) - x[b])
-                change += di * s
+                inside = inside and lower[a] <= x[a] + alpha * d[i, 0] <= upper[a]
+            change = -1.0
+            if not inside:
+                change = 0.0
+                for i in range(free):
+                    a = index[i]
+                    s = g[a]
+                    for j in range(n):
+                        s += H[a, j] * x[j]
+                    for j in range(free):
+                        b = index[j]
+                        s += 0.5 * H[a, b] * (min(max(x[b] + alpha * d[j, 0], lower[b]), upper[b]) - x[b])
+                    change += s * (min(max(x[a] + alpha * d[i, 0], lower[a]), upper[a]) - x[a])
             if change < 0.0:
                 break
             alpha *= 0.5
         for i in range(free):
             a = index[i]
-            x[a] = min(max(x[a] + alpha * work[i, 0], lower[a]), upper[a])
-        if inside and alpha == 1.0:
-            # A full Newton step within the bounds: optimal unless a bound lets go, which the next pass would see.
-            released = False
-            for i in range(n):
-                s = g[i]
-                for j in range(n):
-                    s += H[i, j] * x[j]
-                at_bound = True
-                for j in range(free):
-                    at_bound = at_bound and index[j] != i
-                if at_bound and not ((x[i] <= lower[i] and s > 0) or (x[i] >= upper[i] and s < 0)):
-                    released = True
-            if not released:
-                return free
+            x[a] = min(max(x[a] + alpha * d[i, 0], lower[a]), upper[a])
+        free = _free_set(H, g, lower, upper, x, index, d)
     return free

@@ -6,14 +6,15 @@ Bock, Schloeder 2005). Nothing is scheduled: which foot stands when follows from
 
 import time
 from dataclasses import dataclass, replace
+from math import floor
 
 import numpy as np
-from numba import njit
 
 from slomo.motion import Reference
 from slomo.optimize import ddp, so3
 from slomo.optimize.cost import Task
 from slomo.optimize.dynamics import Body, minus
+from slomo.optimize.jit import compiled
 from slomo.pointfoot import PointFootModel
 from slomo.terrain import Terrain
 
@@ -50,7 +51,7 @@ class MpcConfig:
     terminal: float = 0.1
 
 
-@njit(cache=True)
+@compiled()
 def _sample(t0, dt, qs, vs, us, t, q, v, u):
     """State (linear, rotations along the geodesic) at t of knots t0 + k dt, velocity and input of the step that t is in.
 
@@ -58,37 +59,40 @@ def _sample(t0, dt, qs, vs, us, t, q, v, u):
     """
     N = us.shape[0]
     s = (t - t0) / dt
-    k = int(np.floor(s + 1e-9))
-    if s <= -1e-9 or k >= N:
-        n = 0 if k < N else N
-        q[:], v[:] = qs[n], 0.0
-        u[:] = us[min(n, N - 1)]
-        return
+    k = floor(s + 1e-9)
+    moving = 1.0 if 0 <= k < N else 0.0
+    k = min(max(k, 0), N)
+    n = min(k + 1, N)
     a = min(max(s - k, 0.0), 1.0)
     w = np.empty(3)
-    so3.minus(qs[k + 1, 3:7], qs[k, 3:7], w)
+    so3.minus(qs[n, 3:7], qs[k, 3:7], w)
     so3.plus(qs[k, 3:7], a * w[0], a * w[1], a * w[2], q[3:7])
     for i in range(qs.shape[1]):
         if i < 3 or i >= 7:
-            q[i] = (1 - a) * qs[k, i] + a * qs[k + 1, i]
-    v[:], u[:] = vs[k + 1], us[k]
+            q[i] = (1 - a) * qs[k, i] + a * qs[n, i]
+    for i in range(v.shape[0]):
+        v[i] = moving * vs[n, i]
+    for i in range(u.shape[0]):
+        u[i] = us[min(k, N - 1), i]
 
 
-@njit(cache=True)
+@compiled()
 def _sample_all(t0, dt, qs, vs, us, t, h, q_out, v_out, u_out):
     """`_sample` at knots t + k h; velocities are those of the step that ends at the knot, as in the integrator."""
-    u = np.empty(us.shape[1])
+    u, v = np.empty(us.shape[1]), np.empty(vs.shape[1])
     for k in range(q_out.shape[0]):
-        _sample(t0, dt, qs, vs, us, t + (k - 0.5) * h, q_out[k], v_out[k], u)
-        if k > 0:
-            u_out[k - 1] = u
-        _sample(t0, dt, qs, vs, us, t + k * h, q_out[k], np.empty(vs.shape[1]), u)
+        _sample(t0, dt, qs, vs, us, t + (k - 0.5) * h, q_out[k], v_out[k], u_out[k - 1] if k > 0 else u)
+        _sample(t0, dt, qs, vs, us, t + k * h, q_out[k], v, u)
 
 
 @dataclass(frozen=True)
 class PlanPoint:
-    """The plan at one time, world frame: position (3,) m, quat_xyzw (4,), velocity (3,) m/s, angular_velocity (3,) rad/s in
-    the body frame, points and point_velocities (C, 3), u (C, 3) N force of each point on the body, lam (C, 3) N contact force."""
+    """The plan at one time, world frame.
+
+    Attributes:
+        position: (3,) m.  quat_xyzw: (4,).  velocity: (3,) m/s.  angular_velocity: (3,) rad/s, body frame.
+        points, point_velocities: (C, 3) m, m/s.  u: (C, 3) N, of each point on the body.  lam: (C, 3) N, contact forces.
+    """
 
     position: Array
     quat_xyzw: Array
