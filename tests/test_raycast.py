@@ -125,3 +125,14 @@ def test_the_shadow_falls_away_from_the_sun(ball):
     )  # the ball's centre, along the sun's ray, meets z = 0 at x = -1
     lit = np.linalg.norm(xy - [1.0, 0.0], axis=-1) < 0.3
     assert image.rgb[ground & dark].mean() < 0.8 * image.rgb[ground & lit].mean()
+
+
+def test_the_picture_agrees_with_full_supersampling(ball):
+    scene = Scene({"ball": ball})
+    pose = np.eye(4)
+    pose[:3, 3] = [0.1, 0.2, 0.7]
+    scene.move({"ball": pose})
+    full = scene.render(K, T_WORLD_CAM, SIZE, supersample=3).rgb.astype(int)
+    one = scene.render(K, T_WORLD_CAM, SIZE).rgb
+    picture = scene.picture(K, T_WORLD_CAM, SIZE)
+    assert np.abs(picture - full).mean() < 0.6 * np.abs(one - full).mean()

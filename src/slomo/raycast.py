@@ -160,36 +160,53 @@ class Scene:
         self._mesh.refit()
 
     def render(self, K: np.ndarray, T_world_cam: np.ndarray, size: Sequence[int], *, supersample: int = 1) -> Image:
-        """Cast the rays of one frame. Args: K (3, 3) px; T_world_cam (4, 4); size (width, height) px."""
-        s, (width, height) = supersample, size
-        n = width * height * s * s
+        """Cast supersample^2 rays a pixel. Args: K (3, 3) px; T_world_cam (4, 4); size (width, height) px."""
+        width, height = size
+        rgb, ids, depth, points = self._cast(K, T_world_cam, width, np.arange(width * height), supersample)
+        shape = (height, width, supersample**2)
+        rgb = _display(rgb.reshape(*shape, 3).mean(2))
+        return Image(rgb, ids.reshape(shape), depth.reshape(shape), points.reshape(*shape, 3))
+
+    def picture(self, K: np.ndarray, T_world_cam: np.ndarray, size: Sequence[int]) -> np.ndarray:
+        """(H, W, 3) uint8 RGB for the eye: one ray a pixel, nine where the picture has an edge. Args as `render`."""
+        width, height = size
+        rgb, ids, _, _ = self._cast(K, T_world_cam, width, np.arange(width * height), 1)
+        rgb, ids = rgb.reshape(height, width, 3), ids.reshape(height, width)
+        shade = np.clip(rgb, 0, 1).mean(-1) ** (1 / 2.2)
+        edge = np.zeros((height, width), bool)
+        for axis in (0, 1):
+            step = (np.abs(np.diff(shade, axis=axis)) > 0.06) | (np.diff(ids, axis=axis) != 0)
+            grow = [(0, 0), (0, 0)]
+            for grow[axis] in ((0, 1), (1, 0)):
+                edge |= np.pad(step, grow)
+        again = np.flatnonzero(edge)
+        if len(again):
+            rgb[edge] = self._cast(K, T_world_cam, width, again, 3)[0].reshape(-1, 9, 3).mean(1)
+        return _display(rgb)
+
+    def _cast(
+        self, K: np.ndarray, T_world_cam: np.ndarray, width: int, pixels: np.ndarray, side: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Linear colour (n, 3), id (n,), depth (n,) and point (n, 3) of side^2 samples of each of the pixels."""
+        n = len(pixels) * side**2
         with wp.ScopedDevice(self.device):
             rgb, points = (wp.empty(n, dtype=wp.vec3) for _ in range(2))  # pyright: ignore[reportArgumentType]
             ids, depth = wp.empty(n, dtype=int), wp.empty(n, dtype=float)
-            # Sample i of pixel x lies at x + (i + 1/2)/s - 1/2, which is (column - (s - 1)/2)/s.
-            focal = wp.vec2(s * K[0, 0], s * K[1, 1])
-            centre = wp.vec2(s * K[0, 2] + (s - 1) / 2, s * K[1, 2] + (s - 1) / 2)
             wp.launch(
                 cast,
                 dim=n,
                 inputs=[self._mesh.id, self._normals, self._colors, self._rest, self._ids, self._grain]
-                + [wp.mat33(T_world_cam[:3, :3].ravel()), wp.vec3(*T_world_cam[:3, 3]), focal, centre, width * s]
-                + [self._light],
+                + [wp.mat33(T_world_cam[:3, :3].ravel()), wp.vec3(*T_world_cam[:3, 3])]
+                + [wp.vec2(K[0, 0], K[1, 1]), wp.vec2(K[0, 2], K[1, 2]), width]
+                + [wp.array(pixels.astype(np.int32), dtype=int), side, self._light],
                 outputs=[rgb, ids, depth, points],
             )
+        return rgb.numpy(), ids.numpy(), depth.numpy(), points.numpy()
 
-        def samples(x: np.ndarray) -> np.ndarray:
-            tail = x.shape[1:]
-            x = x.reshape(height, s, width, s, *tail)
-            return np.moveaxis(x, 1, 2).reshape(height, width, s * s, *tail)
 
-        color = np.clip(samples(rgb.numpy()).mean(2), 0, 1) ** (1 / 2.2)
-        return Image(
-            (color * 255 + 0.5).astype(np.uint8),
-            samples(ids.numpy()),
-            samples(depth.numpy()),
-            samples(points.numpy()),
-        )
+def _display(linear: np.ndarray) -> np.ndarray:
+    """uint8 sRGB (by its approximation, gamma 2.2)."""
+    return (np.clip(linear, 0, 1) ** (1 / 2.2) * 255 + 0.5).astype(np.uint8)
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -124,14 +124,19 @@ def cast(
     focal: wp.vec2,
     centre: wp.vec2,
     width: int,
+    pixels: wp.array(dtype=int),
+    side: int,
     L: LightStruct,
     rgb: wp.array(dtype=wp.vec3),
     ids: wp.array(dtype=int),
     depth: wp.array(dtype=float),
     points: wp.array(dtype=wp.vec3),
 ):
+    """Sample n % side^2 of pixel `pixels[n // side^2]`: samples lie on a side x side grid over the pixel."""
     n = wp.tid()
-    px, py = float(n % width), float(n // width)
+    pixel, k = pixels[n // (side * side)], n % (side * side)
+    px = float(pixel % width) + (float(k % side) + 0.5) / float(side) - 0.5
+    py = float(pixel // width) + (float(k // side) + 0.5) / float(side) - 0.5
     ray = wp.vec3((px - centre[0]) / focal[0], (py - centre[1]) / focal[1], 1.0)
     d = wp.normalize(R * ray)
     id = int(-1)  # noqa: RUF046, UP018 (a literal would be a constant to Warp)
