@@ -23,6 +23,9 @@ STATUS = ("converged", "iteration limit", "no descent", "not finite")
 
 # Proximal weights of the Levenberg-Marquardt term: positions, velocities, inputs (1/m^2, s^2/m^2, 1/N^2).
 _PROX_Q, _PROX_V, _PROX_U = 1.0, 1e-2, 1e-4
+# Least weight of the gaps in the merit function. Near an optimum the cost's slope vanishes while closing a gap still
+# costs in second order; without this the line search refuses the good step, as for a robot that simply stands.
+_LEAST_PENALTY = 1e-2
 
 
 class Iterate(NamedTuple):
@@ -223,7 +226,7 @@ def solve(body, task, kappa, it, rho, free_start, max_iterations, tolerance, reg
     """
     N = it.us.shape[0]
     J, G = evaluate(body, task, kappa, it, rho, w.gap, w.q1, w.v1)
-    nu = 0.0
+    nu = _LEAST_PENALTY
     if not isfinite(J + G):
         return NOT_FINITE, 0, J, G, reg
     for iteration in range(max_iterations):
