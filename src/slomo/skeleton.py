@@ -41,6 +41,14 @@ class Gait:
 
 
 @dataclass(frozen=True)
+class Posture:
+    """An alternative to the rest pose: (link, (x, y, z) rad) of the joints that differ."""
+
+    name: str
+    joints: tuple[tuple[int, tuple[float, float, float]], ...]
+
+
+@dataclass(frozen=True)
 class Skeleton:
     """A skeleton at rest. Links are numbered as in `link_names` (root first, parents before children), nodes as in `names`.
 
@@ -52,6 +60,7 @@ class Skeleton:
         mirror: (M,) index of the node on the other side, itself for the median plane.
         lower, upper, sigma: (B, 3) rad about x, y, z; the root's row is free.
         capsule_names, capsule_link (C,), capsule_nodes (C, 2), capsule_shift (C, 2, 3), capsule_radii (C, 2), capsule_mirror (C,).
+        postures: sets of alternatives; of each set the rest or one may hold.
         sole: height of a contact node above the ground in stance, body lengths.
     """
 
@@ -79,6 +88,7 @@ class Skeleton:
     limbs: tuple[Limb, ...]
     gaits: tuple[Gait, ...]
     sole: float
+    postures: tuple[tuple[Posture, ...], ...]
 
     def index(self, name: str) -> int:
         """Number of a node. Raises `InvalidData` listing the names there are."""
@@ -176,6 +186,10 @@ def _flip_limb(entry: Mapping[str, Any]) -> dict[str, Any]:
     )
 
 
+def _flip_postures(entry: Mapping[str, Any]) -> dict[str, Any]:
+    return {_flip(p): {_flip(j): [-x, y, -z] for j, (x, y, z) in joints.items()} for p, joints in entry.items()}
+
+
 def _build(d: Mapping[str, Any], where: str) -> Skeleton:
     joints = _mirrored(d["joints"], _flip_node)
     points = _mirrored(d["points"], _flip_node)
@@ -248,4 +262,14 @@ def _build(d: Mapping[str, Any], where: str) -> Skeleton:
             for n, g in d["gaits"].items()
         ),
         sole=float(d["sole"]),
+        postures=tuple(
+            tuple(
+                Posture(
+                    f"{part} {name}",
+                    tuple((number(j, links, name), tuple(np.radians(a).tolist())) for j, a in changes.items()),
+                )
+                for name, changes in alternatives.items()
+            )
+            for part, alternatives in _mirrored(d.get("postures", {}), _flip_postures).items()
+        ),
     )

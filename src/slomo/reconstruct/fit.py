@@ -120,9 +120,17 @@ def _to_gait(
     t = obs.t.numpy()
     entries: list[tuple[float, int, GaitHypothesis, Guess]] = []
     gaits = {g.name: g for g in skeleton.gaits}
+    postures, posture_names = hypotheses.posture_angles(kin)
+    posed: list[Guess] = []
     for k in keep:
         one = torch.tensor([k])
         base = run.guess.pick(one)
+        wide = base.pick(torch.zeros(len(postures), dtype=torch.long))
+        guess = replace(wide, q=wide.q + postures[:, None])
+        value = rank(problem, _pick(run.x, one.expand(len(postures))), guess, draws=2, frames=12, pixels=200)
+        base = guess.pick(value.argmin()[None])
+        run.labels[k] = run.labels[k] | {"posture": posture_names[int(value.argmin())]}
+        posed.append(base)
         for i in range(0, len(grid), 24):
             chunk = grid[i : i + 24]
             poses = [hypotheses.gait_pose(kin, gaits[g.name], g, t, speed=root.speed, leg=leg) for g in chunk]
@@ -135,8 +143,8 @@ def _to_gait(
             progress.update(0.02 + 0.05 * i / len(grid), f"trying {len(grid)} gaits")
     entries.sort(key=lambda e: e[0])
     chosen = _diverse(entries, effort.candidates - len(keep))
-    which = torch.tensor([k for k in keep] + [k for _, k, _, _ in chosen])
-    guesses = [run.guess.pick(torch.tensor([k])) for k in keep] + [g for *_, g in chosen]
+    which = torch.tensor(keep + [k for _, k, _, _ in chosen])
+    guesses = posed + [g for *_, g in chosen]
     labels = [run.labels[k] | {"gait": "none"} for k in keep]
     labels += [
         run.labels[k] | {"gait": g.name, "stride_hz": round(g.frequency, 3), "phase": round(g.phase, 3)}

@@ -1,5 +1,6 @@
 """Guesses to start from: the root path from the masks and the ground, headings, and gaits with frequency and phase."""
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ from slomo.reconstruct.trajectory import Guess
 from slomo.skeleton import Gait, Skeleton
 
 Array = np.ndarray
+Tensor = torch.Tensor
 GRAVITY = 9.81
 
 
@@ -118,6 +120,19 @@ def heading_guess(kin: Kinematics, root: RootGuess, T: int) -> tuple[Guess, list
     q = torch.zeros(H, T, kin.B, 3)
     stance = torch.full((H, T, len(s.limbs)), -1.0)
     return Guess(position=f(np.concatenate([xy, z], -1)), yaw=f(yaw), q=q, stance=stance), names
+
+
+def posture_angles(kin: Kinematics) -> tuple[Tensor, list[str]]:
+    """(N, B, 3) rad: every combination of the skeleton's postures, the rest pose first, and what they are called."""
+    angles, names = [], []
+    for combination in itertools.product(*[(None, *alternatives) for alternatives in kin.skeleton.postures]):
+        q = torch.zeros(kin.B, 3)
+        for posture in combination:
+            for joint, xyz in posture.joints if posture else ():
+                q[joint] += torch.tensor(xyz)
+        angles.append(q)
+        names.append(", ".join(p.name for p in combination if p) or "rest")
+    return torch.stack(angles), names
 
 
 def stride_frequencies(obs: Observations, low: float, high: float) -> list[float]:

@@ -1,0 +1,136 @@
+"""The parts of the fit: kinematics, projection, distances, flow, hypotheses."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from slomo.reconstruct import hypotheses, silhouette
+from slomo.reconstruct.hypotheses import GaitHypothesis
+from slomo.reconstruct.kinematics import Kinematics, joint_rotation
+from slomo.reconstruct.silhouette import Intrinsics, Outline
+from slomo.skeleton import list_skeletons, load_skeleton
+
+
+@pytest.fixture(params=list_skeletons())
+def kin(request: pytest.FixtureRequest) -> Kinematics:
+    return Kinematics(load_skeleton(request.param))
+
+
+def _posed(kin: Kinematics, q: torch.Tensor, R: torch.Tensor, shape=None):
+    H, T = q.shape[:2]
+    return kin.pose(shape or kin.shape_variables(H), torch.zeros(H, T, 3), R.expand(H, T, 3, 3), q)
+
+
+def test_joint_rotation_is_flexion_then_abduction_then_twist():
+    q = torch.tensor([[0.3, -1.1, 0.7]])
+    want = Rotation.from_euler("YXZ", [-1.1, 0.3, 0.7]).as_matrix()
+    np.testing.assert_allclose(joint_rotation(q)[0].numpy(), want, atol=1e-6)
+
+
+def test_the_rest_pose_is_the_skeletons(kin: Kinematics):
+    body = _posed(kin, torch.zeros(1, 1, kin.B, 3), torch.eye(3))
+    np.testing.assert_allclose(body.nodes[0, 0].numpy(), kin.skeleton.rest(), atol=1e-6)
+
+
+def test_mirrored_angles_give_the_mirrored_body(kin: Kinematics):
+    generator = torch.Generator().manual_seed(0)
+    q = 0.4 * torch.randn(1, 1, kin.B, 3, generator=generator)
+    shape = {k: torch.randn(v.shape, generator=generator) for k, v in kin.shape_variables(1).items()}
+    other = torch.as_tensor(kin.skeleton.mirror[: kin.B])
+    mirrored = q[:, :, other] * torch.tensor([-1.0, 1.0, -1.0])
+    a = _posed(kin, q, torch.eye(3), shape).nodes[0, 0].numpy()
+    b = _posed(kin, mirrored, torch.eye(3), shape).nodes[0, 0].numpy()
+    np.testing.assert_allclose(b[kin.skeleton.mirror] * [1, -1, 1], a, atol=1e-5)
+
+
+def test_bones_keep_their_lengths(kin: Kinematics):
+    q = torch.randn(1, 5, kin.B, 3, generator=torch.Generator().manual_seed(1))
+    x = _posed(kin, q, torch.eye(3)).nodes[0].numpy()
+    link = kin.skeleton.link
+    lengths = np.linalg.norm(x[:, 1:] - x[:, link[1:]], axis=-1)
+    np.testing.assert_allclose(lengths, np.tile(np.linalg.norm(kin.skeleton.offset[1:], axis=1), (5, 1)), atol=1e-5)
+
+
+def _random_outline(generator: torch.Generator) -> list[torch.Tensor]:
+    ends = 40 * torch.rand(4, 1, 1, 5, generator=generator, dtype=torch.float64)
+    r = 1 + 4 * torch.rand(1, 1, 5, generator=generator, dtype=torch.float64)
+    return [e.clone().requires_grad_() for e in (*ends, r, r)]
+
+
+def test_distance_gradient_against_finite_differences():
+    """With equal radii at both ends the written-out gradient is exact (see `_Distance`)."""
+    generator = torch.Generator().manual_seed(3)
+    args = _random_outline(generator)
+    u, v = (40 * torch.rand(1, 6, generator=generator, dtype=torch.float64) for _ in range(2))
+    z = torch.ones(1, 1, 5, dtype=torch.float64)
+
+    def sd(ua, va, ub, vb, r):
+        return silhouette.distances(Outline(ua, va, z, ub, vb, z, r, r), u, v)[0]
+
+    assert torch.autograd.gradcheck(sd, args[:5], eps=1e-5, atol=1e-4)
+
+
+def test_distance_of_a_tapered_capsule():
+    one = lambda x: torch.tensor([[[float(x)]]])  # noqa: E731
+    o = Outline(one(0), one(0), one(1), one(10), one(0), one(1), one(2), one(1))
+    sd, h = silhouette.distances(o, torch.tensor([[5.0, -3.0, 12.0]]), torch.tensor([[4.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(sd[0, 0, :, 0].numpy(), [2.5, 1.0, 1.0], atol=1e-3)
+    np.testing.assert_allclose(h[0, 0, :, 0].numpy(), [0.5, 0.0, 1.0], atol=1e-5)
+
+
+def test_the_surface_point_lies_on_the_pixels_ray_and_in_front():
+    K = Intrinsics(100, 100, 50, 30, 100, 60)
+    a, b = torch.tensor([[[[-0.2, 0.0, 2.0]]]]), torch.tensor([[[[0.2, 0.0, 2.0]]]])
+    o = silhouette.outline(K, a, b, torch.tensor([[[0.1, 0.1]]]))
+    u, v = torch.tensor([[50.0]]), torch.tensor([[30.0]])
+    sd, h = silhouette.distances(o, u, v)
+    c, meets = silhouette.visible(K, o, sd, h)
+    assert meets.all()
+    X = silhouette.surface(K, o, c, u, v)[0, 0, 0]
+    np.testing.assert_allclose(X.numpy(), [0, 0, 1.9], atol=2e-3)
+
+
+def test_the_nearer_of_two_capsules_is_seen():
+    K = Intrinsics(100, 100, 50, 30, 100, 60)
+    a = torch.tensor([[[[-0.2, 0.0, 2.0], [-0.2, 0.0, 1.5]]]])
+    o = silhouette.outline(K, a, a + torch.tensor([0.4, 0, 0]), torch.full((1, 2, 2), 0.1))
+    sd, h = silhouette.distances(o, torch.tensor([[50.0]]), torch.tensor([[30.0]]))
+    assert int(silhouette.visible(K, o, sd, h)[0]) == 1
+
+
+def test_feet_of_a_hypothetical_walk_go_back_in_stance_and_forward_in_swing():
+    kin = Kinematics(load_skeleton("quadruped"))
+    walk = next(g for g in kin.skeleton.gaits if g.name == "walk")
+    t = np.linspace(0, 2, 200)
+    g = GaitHypothesis("walk", 1.0, 0.0)
+    q, contact = hypotheses.gait_pose(kin, walk, g, t, speed=np.full(200, 0.8), leg=0.75)
+    assert contact.mean(0) == pytest.approx([walk.duty] * 4, abs=0.02)
+    body = _posed(kin, torch.as_tensor(q, dtype=torch.float32)[None], torch.eye(3))
+    for n, limb in enumerate(kin.skeleton.limbs):
+        x = body.nodes[0, :, limb.contact].numpy()
+        v = np.gradient(x[:, 0], t)
+        stands = contact[:, n] > 0
+        inner = stands & np.roll(stands, 5) & np.roll(stands, -5)
+        assert v[inner].mean() == pytest.approx(-0.8, rel=0.25)
+        assert v[~stands].mean() > 0.5
+        assert x[~stands, 2].max() > x[stands, 2].mean() + 0.05
+
+
+def test_whittaker_keeps_a_line_and_drops_an_outlier():
+    t = np.arange(60.0)
+    y = np.stack([2 * t, -t], 1)
+    y[30] += 500
+    x = hypotheses.whittaker(y, np.ones(60), 4.0)
+    np.testing.assert_allclose(x[20:25], y[20:25], atol=1.0)
+
+
+def test_posture_angles_hold_every_combination(kin: Kinematics):
+    angles, names = hypotheses.posture_angles(kin)
+    assert len(angles) == math.prod(1 + len(p) for p in kin.skeleton.postures)
+    assert names[0] == "rest"
+    assert not angles[0].any()
+    inside = (angles >= kin.lower) & (angles <= kin.upper)
+    assert inside[:, 1:].all()
