@@ -1,9 +1,11 @@
 """A line of stages that do next to nothing, for testing the machinery around them.
 
-Run as a program it is `slomo` with these stages: `python fake_line.py reconstruct clip.txt`.
+Run as a program it is `slomo` with these stages: `python fake_line.py reconstruct clip.txt`. With the environment
+variable FAKE_GATE the fit stops in its middle until that file exists.
 """
 
 import dataclasses
+import os
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -38,7 +40,6 @@ class FitConfig:
     skeleton: str = "quadruped"
     length_m: float = 0.5
     iterations: int = 20
-    pause: float = 0.0  # s each iteration
     seed: int = 0
 
     def __post_init__(self):
@@ -88,10 +89,12 @@ def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
     rng = _rng(state["rng"])
     while i < config.iterations:
         x, i = 0.9 * x + rng.normal(size=4), i + 1
-        time.sleep(config.pause)
         progress.update(i / config.iterations, f"iteration {i}")
         if progress.checkpoint_due() or i % 2 == 0:
             progress.save({"x": x, "i": np.array(i), "rng": _rng_state(rng)})
+        while i == config.iterations // 2 and not Path(os.environ.get("FAKE_GATE", ".")).exists():
+            time.sleep(0.02)
+            progress.update(i / config.iterations, "waiting at the gate")
     t = np.arange(5) / 30
     arrays = {"t": t, "keypoints": np.tile(x[:3], (5, 2, 1)), "keypoint_names": np.array(["a", "b"])}
     return Artifact(npz={"keypoints.npz": arrays}, json={"report.json": {"length": config.length_m}})
@@ -129,12 +132,16 @@ def run_report(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     return Artifact(blobs={"side_by_side.mp4": " ".join(sorted(inputs.artifacts)).encode()})
 
 
+def replacements() -> dict[str, pipeline.StageSpec]:
+    """The table with these stages."""
+    real = {n: s for n, s in pipeline.STAGES.items() if n != "import"}
+    runs = {n: "run_report" if n == "report" else s.run for n, s in real.items()}
+    return {n: dataclasses.replace(s, module="fake_line", run=runs[n]) for n, s in real.items()}
+
+
 def install() -> None:
     """Put these stages and robots in the place of the real ones."""
-    for name, spec in list(pipeline.STAGES.items()):
-        if name != "import":
-            run = "run_report" if name == "report" else spec.run
-            pipeline.STAGES[name] = dataclasses.replace(spec, module="fake_line", run=run)
+    pipeline.STAGES.update(replacements())
     pipeline.load_robot = load_robot
     pipeline._find_weights = lambda: None
 

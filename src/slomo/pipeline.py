@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib
-import importlib.util
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -111,11 +110,7 @@ def _find_weights() -> Path | None:
 
 def template() -> str:
     """A new project's slomo.toml."""
-    return settings.template({s.name: s.of_module(s.config) for s in STAGES.values() if _written(s)})
-
-
-def _written(spec: StageSpec) -> bool:
-    return importlib.util.find_spec(spec.module) is not None
+    return settings.template({s.name: s.of_module(s.config) for s in STAGES.values()})
 
 
 @dataclass(frozen=True)
