@@ -31,7 +31,7 @@ def umeyama(
 
 
 def kabsch(source: Array, target: Array, *, weights: Array | None = None) -> tuple[Array, Array]:
-    """Rotation R (3, 3) and translation p (3,) that minimise sum w |R source + p - target|^2; arguments as `umeyama`."""
+    """Rotation R (3, 3) and translation p (3,) that minimise sum w |R source + p - target|^2; as `umeyama`."""
     _, R, p = umeyama(source, target, weights=weights, scale=False)
     return R, p
 

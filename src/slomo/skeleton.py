@@ -1,7 +1,7 @@
 """Kinematic skeletons as data: B links, N spherical joints, read from TOML.
 
-A skeleton is a tree of nodes. The root and the joints carry a link (a frame) each; points are fixed to a link. Every node
-is a key point of the same name. Lengths are fractions of the body length; in the rest pose every link's frame has x
+A skeleton is a tree of nodes. The root and the joints carry a link (a frame) each; points are fixed to a link. Every
+node is a key point of the same name. Lengths are fractions of the body length; in the rest pose every link's frame has x
 forward, y left and z up. Capsules give the links their volume. Entries whose name contains "left" are mirrored.
 """
 
@@ -22,7 +22,7 @@ Array = np.ndarray
 
 @dataclass(frozen=True)
 class Limb:
-    """A leg as gait hypotheses need it: its contact node, the joint that swings it, and (joint, radians of y at mid-swing)."""
+    """A leg as gait hypotheses need it: contact node, the joint that swings it, (joint, rad of y at mid-swing)."""
 
     name: str
     contact: int
@@ -50,7 +50,7 @@ class Posture:
 
 @dataclass(frozen=True)
 class Skeleton:
-    """A skeleton at rest. Links are numbered as in `link_names` (root first, parents before children), nodes as in `names`.
+    """A skeleton at rest. Links are numbered root first, parents before children; nodes as in `names`.
 
     Attributes:
         names: M node names, links first (node j < B is the origin of link j), then points.
@@ -59,7 +59,8 @@ class Skeleton:
         group: (M,) index into `group_names`, -1 for the root; `group_spread`: s.d. of the log length of each group.
         mirror: (M,) index of the node on the other side, itself for the median plane.
         lower, upper, sigma: (B, 3) rad about x, y, z; the root's row is free.
-        capsule_names, capsule_link (C,), capsule_nodes (C, 2), capsule_shift (C, 2, 3), capsule_radii (C, 2), capsule_mirror (C,).
+        capsule_names, capsule_link (C,), capsule_nodes (C, 2), capsule_shift (C, 2, 3), capsule_radii (C, 2),
+            capsule_mirror (C,): the body's volume, rounded cones between two nodes of a link, body lengths.
         postures: sets of alternatives; of each set the rest or one may hold.
         sole: height of a contact node above the ground in stance, body lengths.
     """

@@ -1,7 +1,7 @@
-"""The fit, coarse to fine: size and trunk with headings, then gaits with the legs, then the rivals, then the winner alone.
+"""The fit, coarse to fine: size and trunk with headings, then gaits with the legs, then the rivals, then the winner.
 
-Every phase is one `optimise` of a batch of hypotheses; between phases they are ranked by loss on fixed draws and the best go
-on. All of it is deterministic by the seed, and a checkpoint within any phase resumes to the same bits.
+Every phase is one `optimise` of a batch of hypotheses; between phases they are ranked by loss on fixed draws and the
+best go on. All of it is deterministic by the seed, and a checkpoint within any phase resumes to the same bits.
 """
 
 import json
@@ -107,7 +107,7 @@ def _pick(x: Variables, which: Tensor) -> Variables:
 def _to_gait(
     problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, metres: float, progress: Progress
 ) -> Run:
-    """Lay gaits over the best heading (two when they are close), rank them as they are, keep the best few and "no gait"."""
+    """Lay postures and gaits over the best heading (two when close), rank them as they are, keep the best and "none"."""
     order = losses.argsort()
     keep = [int(order[0])]
     keep += [int(k) for k in order[1:2] if losses[k] < 1.15 * losses[order[0]]]

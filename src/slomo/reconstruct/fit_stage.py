@@ -5,12 +5,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 
 from slomo.errors import UsageError
 from slomo.reconstruct import fit as fitting
 from slomo.reconstruct import hypotheses
-from slomo.reconstruct.kinematics import Kinematics, Posed
+from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.observations import Observations, observe
 from slomo.reconstruct.outcome import Outcome, assess
 from slomo.reconstruct.problem import Problem, Schedule
@@ -20,8 +19,8 @@ from slomo.stage import Artifact, Inputs, Progress
 
 FIT_VERSION = 1
 
-# Two shapes of random place overlap at about 0.3, the rest pose at the right place at 0.5 to 0.6; a fit that is right has
-# 0.75 and more. Below this the key points do not follow the subject.
+# The rest pose at the right place overlaps by 0.5 to 0.6, a fit that is right by 0.75 and more. Below this the body is
+# elsewhere or another shape in many frames, and its key points do not follow the subject.
 MIN_IOU = 0.45
 
 
@@ -31,7 +30,7 @@ class FitConfig:
 
     Attributes:
         skeleton: "quadruped", "human" or the path of a TOML file.
-        length_m: m, withers to tail base of a quadruped or standing height of a human; 0 takes the skeleton's typical length.
+        length_m: m, withers to tail base of a quadruped, standing height of a human; 0: the skeleton's typical length.
         seed: of every random choice.
         fps: fit frames a second at most. subject_px: size of the subject in working pixels (root of its area).
         width: neurons of the hidden layers of Q and G. joint_hz, root_hz: highest frequency of their time features.
@@ -77,8 +76,8 @@ class FitConfig:
 def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
     """Fit the skeleton to masks and flow.
 
-    Reads the artifacts "decode" (frames.npz: t), "masks" (masks.npz, flow.npz) and "camera" (camera.npz, report.json), and
-    the file "skeleton" where the configuration names a path.
+    Reads the artifacts "decode" (frames.npz: t), "masks" (masks.npz, flow.npz) and "camera" (camera.npz, report.json),
+    and the file "skeleton" where the user gave one.
 
     Returns:
         keypoints.npz and report.json; `failure` is set when the body hardly overlaps the masks.
@@ -135,6 +134,3 @@ def _arrays(obs: Observations, skeleton: Skeleton, o: Outcome, masks: Any, K: np
         contact_names=np.array([skeleton.names[c] for c in skeleton.contacts]),
         K=np.asarray(K, float), T_world_cam=o.T_world_cam, packed=masks["packed"], shape=masks["shape"],
     )  # fmt: skip
-
-
-__all__ = ["FIT_VERSION", "FitConfig", "Posed", "run_fit", "torch"]

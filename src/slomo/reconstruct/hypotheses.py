@@ -27,8 +27,8 @@ class GaitHypothesis:
 
 
 def whittaker(y: Array, weight: Array, smoothness: float) -> Array:
-    """(T, D) smoothed y (T, D): weighted least squares with squared second differences (Whittaker 1923), reweighted to
-    be robust (Cauchy, three rounds). `smoothness` in frames is about the half width of the kernel."""
+    """(T, D) smoothed y (T, D): least squares with squared second differences (Whittaker 1923), made robust by Cauchy
+    reweighting. `smoothness` in frames is about the half width of the kernel."""
     T = len(y)
     D = np.diff(np.eye(T), 2, axis=0)
     penalty = smoothness**4 * D.T @ D + 1e-9 * np.eye(T)
@@ -43,8 +43,8 @@ def whittaker(y: Array, weight: Array, smoothness: float) -> Array:
 
 @dataclass(frozen=True)
 class RootGuess:
-    """Coarse path of the subject: middle of the body on the ground (T, 2), body length, heading of travel (T,) rad, distance
-    travelled in body lengths; world units."""
+    """Coarse path of the subject, world units: middle of the body on the ground (T, 2), body length, heading of travel
+    (T,) rad, distance travelled and speed (T,) in body lengths (and s)."""
 
     middle: Array
     length: float
@@ -138,8 +138,8 @@ def posture_angles(kin: Kinematics) -> tuple[Tensor, list[str]]:
 def stride_frequencies(obs: Observations, low: float, high: float) -> list[float]:
     """Candidate stride frequencies Hz from the self-similarity of the leg band, most likely first.
 
-    Masks are cut to their box's lower half; the mean difference between frames a lag apart dips at the stride period, and
-    about as deep at half of it where left and right look alike: both readings of each dip are candidates.
+    Masks are cut to their box's lower half; the mean difference between frames a lag apart dips at the stride period,
+    and about as deep at half of it where left and right look alike: both readings of each dip are candidates.
     """
     import cv2
 

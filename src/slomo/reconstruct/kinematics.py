@@ -1,6 +1,6 @@
 """Forward kinematics of a skeleton in torch, for H hypotheses and T times at once.
 
-Shape variables are unit normals: each is multiplied by the spread of what it changes, so that the prior is their square.
+Shape variables are unit normals: each is multiplied by the spread of what it changes; the prior is their square.
 """
 
 from dataclasses import dataclass
@@ -103,7 +103,7 @@ class Kinematics:
 
     def pose(self, shape: dict[str, Tensor], position: Tensor, R_root: Tensor, q: Tensor) -> Posed:
         """Forward kinematics. position (H, T, 3), R_root (H, T, 3, 3), q (H, T, B, 3) rad with an unused root row."""
-        H, T = position.shape[:2]
+        H = len(position)
         offset = self.offsets(shape)
         local = joint_rotation(q)
         R: list[Tensor] = [R_root] * self.B

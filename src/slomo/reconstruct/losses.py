@@ -1,7 +1,7 @@
 """Evidence: what the posed body is compared with, as a list of terms with one signature.
 
-A term maps a `State` (the posed body, its projection, the draw of pixels) to one number per hypothesis, dimensionless and of
-order one when the pose is off by a limb's width. A learned prior, a neural field or a physics roll-out is another term.
+A term maps a `State` (the posed body, its projection, the draw of pixels) to one number per hypothesis, dimensionless
+and of order one when the pose is off by a limb's width. A learned prior, a neural field, physics: each is another term.
 """
 
 from collections.abc import Callable
@@ -28,10 +28,10 @@ class State:
         body: posed at the F fit frames. q: (H, F, B, 3). R_root: (H, F, 3, 3).
         shape: the unit-normal shape variables. tilt: (H, 2) unit-normal camera tilt.
         R_cam, centre: (H, F, 3, 3) world to camera, (H, F, 3).
-        seen: frames drawn for image terms (S,), as positions among the fit frames; u, v: (S, P) px, the first `inside` of
-            the P pixels lie in the mask. out: outline of the capsules there; sd, h: (H, S, P, C).
+        seen: frames drawn for image terms (S,), as positions among the fit frames; u, v: (S, P) px, flat index
+            `pixel`; the first `inside` of the P lie in the mask. out: outline of the capsules there; sd, h: (H, S, P, C).
         ends: camera-frame capsule ends (H, F, C, 3) a and b.
-        stance: (H, F-1, L) hypothetical contact times its present weight; negative where there is no hypothesis.
+        stance: (H, F-1, L) hypothetical contact times its present weight; negative where there is none.
     """
 
     obs: Observations
@@ -134,7 +134,8 @@ def carry(s: State, k: Tensor, c: Tensor, X: Tensor) -> Tensor:
 
 
 def feet(s: State) -> tuple[Tensor, Tensor, Tensor]:
-    """Height above their stance height (H, F, L), and velocity to the next fit frame (H, F-1, L, 3), in body lengths (and s)."""
+    """Height above stance height (H, F, L), velocity to the next fit frame (H, F-1, L, 3), both in body lengths (and s),
+    and place (H, F, L, 3) in the world."""
     L = s.body.length[:, None, None]
     x = s.body.nodes[:, :, s.kin.contacts]
     height = x[..., 2] / L - s.kin.skeleton.sole
@@ -203,7 +204,7 @@ def limits(s: State) -> Tensor:
 
 
 def forward(s: State) -> Tensor:
-    """Animals and people move mostly the way they face: sideways and backward speed, saturating, in half body lengths / s."""
+    """Animals and people mostly move the way they face: sideways and backward speed in half body lengths / s, robust."""
     p, L = s.body.nodes[:, :, 0, :2], s.body.length[:, None, None]
     v = (p[:, 1:] - p[:, :-1]) / L / s.obs.dt[:, None]
     ahead = s.R_root[:, :-1, :2, 0]

@@ -1,8 +1,9 @@
 """What the fit compares with: masks, distance transforms, chained flow and cameras, at a working resolution.
 
-Fit frames are every `step`-th frame of the clip; the flow between two of them is the flow of the frames between, chained.
+Fit frames are every n-th frame of the clip; the flow between two of them is the flow of the frames between, chained.
 """
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -79,7 +80,7 @@ def observe(
         raise InvalidData(f"the parts disagree about the number of frames: {counts}", where="reconstruct")
     rate = (T - 1) / max(float(frames_t[-1] - frames_t[0]), 1e-9)
     step = max(1, round(rate / fps))
-    if T <= 2 * step:
+    if step > T // 3:
         step = 1
     at = np.arange(0, T, step)
     full = unpack(masks["packed"][at], masks["shape"])
@@ -135,9 +136,9 @@ def _cumulative(p: Array) -> Tensor:
 
 
 def _chain(flow: Mapping[str, Array], at: Array, width: int) -> tuple[Array, Array]:
-    """Flow between consecutive fit frames: each pixel is carried through the frames between. (F-1, H, W, 2), (F-1, H, W)."""
+    """Flow between consecutive fit frames, (F-1, H, W, 2) and (F-1, H, W): pixels are carried through those between."""
     out, ok_out = [], []
-    for a, b in zip(at[:-1], at[1:], strict=True):
+    for a, b in itertools.pairwise(at):
         total = np.asarray(flow["flow"][a], np.float32)
         h, w = total.shape[:2]
         ok = np.unpackbits(flow["consistent"][a], axis=-1)[:, :width].astype(np.float32)

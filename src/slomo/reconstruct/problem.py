@@ -17,7 +17,7 @@ Variables = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class Draw:
-    """Pixels of one evaluation: frames `seen` (S,) among the fit frames, flat indices (S, P), the first `inside` in the mask."""
+    """Pixels of one evaluation: frames `seen` (S,) among the fit frames, flat indices (S, P), first `inside` of mask."""
 
     seen: Tensor
     pixel: Tensor
@@ -46,7 +46,7 @@ class Problem:
         return shape | {"tilt": torch.zeros(H, 2)} | self.path.variables(H, generator)
 
     def cameras(self, tilt: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
-        """World-to-camera rotations (H, T, 3, 3) and centres (H, T, 3) after the world has been tilted about the mean centre."""
+        """World-to-camera rotations (H, T, 3, 3) and centres (H, T, 3), tilted about the mean centre."""
         T = torch.as_tensor(self.obs.T_world_cam[at], dtype=torch.float32)
         mean = torch.as_tensor(self.obs.T_world_cam[:, :3, 3].mean(0), dtype=torch.float32)
         # About the mean camera's own right and forward axes, laid level: pitch and roll.
@@ -107,7 +107,6 @@ class Schedule:
     Attributes:
         iterations; frames and pixels of each draw; learn: prefixes of the variables that change.
         stance: weight of the hypothetical contacts at the start; it falls to 0 at two thirds.
-        decay: False keeps the rates.
     """
 
     iterations: int
@@ -136,7 +135,7 @@ def optimise(
     start: int = 0, adam_state: dict | None = None,
     each: Callable[[int, torch.optim.Adam, Tensor], None] = lambda i, optimiser, loss: None,
 ) -> Variables:  # fmt: skip
-    """Run one phase from iteration `start`; `each(iteration, optimiser, loss (H,))` is called before every step but the first.
+    """Run one phase from iteration `start`; `each(iterations done, optimiser, loss (H,))` is called after every step.
 
     Hypotheses share nothing, so the sum of their losses is minimised.
     """

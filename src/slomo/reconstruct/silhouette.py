@@ -1,7 +1,7 @@
 """The soft silhouette of capsules, and the surface point that each pixel sees.
 
-A capsule projects to a tapered segment: its signed distance in the image, in pixels, is the distance to the projected axis
-minus the projected radius there. Occupancy is a sigmoid of the smooth minimum over capsules.
+A capsule projects to a tapered segment: its signed distance in the image, in pixels, is the distance to the projected
+axis minus the projected radius there. Occupancy is a sigmoid of the smooth minimum over capsules.
 """
 
 from dataclasses import dataclass
@@ -99,7 +99,7 @@ def soft_min(sd: Tensor, temperature: float) -> Tensor:
 
 
 def visible(K: Intrinsics, o: Outline, sd: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
-    """The capsule that each pixel sees, (H, T, P), and whether it sees one: the nearest front surface of those it meets."""
+    """The capsule that each pixel sees, (H, T, P), and whether it sees one: the nearest front of those it meets."""
     with torch.no_grad():
         radius = o.ra[:, :, None] + h * (o.rb - o.ra)[:, :, None]
         z = o.za[:, :, None] + h * (o.zb - o.za)[:, :, None]

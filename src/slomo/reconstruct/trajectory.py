@@ -1,9 +1,10 @@
 """Joint angles Q(t) and root pose G(t) as MLPs over Fourier features of time, H hypotheses at once.
 
-Both are corrections on top of a coarse guess: the root path from the masks, and the swing of a hypothetical gait (or the
-rest pose). The last layers start at zero, so the first pose is the guess.
+Both are corrections on top of a coarse guess: the root path from the masks, and the swing of a hypothetical gait (or
+the rest pose). The last layers start at zero, so the first pose is the guess.
 """
 
+import itertools
 import math
 from dataclasses import dataclass, fields
 
@@ -47,7 +48,7 @@ def features(t: Tensor, duration: float, highest: float) -> Tensor:
 def mlp_variables(name: str, sizes: tuple[int, ...], H: int, generator: torch.Generator) -> dict[str, Tensor]:
     """Weights of an MLP for each hypothesis (the same start for all): He initialisation, last layer zero."""
     out = {}
-    for n, (i, o) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+    for n, (i, o) in enumerate(itertools.pairwise(sizes)):
         last = n == len(sizes) - 2
         w = torch.zeros(i, o) if last else torch.randn(i, o, generator=generator) * math.sqrt(2 / i)
         out[f"{name}.w{n}"] = w.expand(H, i, o).clone()
