@@ -79,6 +79,7 @@ def reconstruct_structure(
             "overlap": overlap,
             "seed": seed,
             "threads": threads,
+            "seconds": 90,
         }
         (root / "job.json").write_text(json.dumps(job))
         done = subprocess.run(
@@ -123,7 +124,9 @@ def _main(folder: str) -> None:
     pycolmap.match_sequential(database, matching_options=matching, pairing_options=pairing)
     mapping = pycolmap.IncrementalPipelineOptions()
     mapping.num_threads, mapping.random_seed = job["threads"], job["seed"]
-    mapping.multiple_models, mapping.extract_colors = False, False
+    # A first pair that leads nowhere is dropped and another is tried, which only happens with several models.
+    mapping.multiple_models, mapping.max_num_models, mapping.extract_colors = True, 3, False
+    mapping.max_runtime_seconds = job["seconds"]
     mapping.ba_refine_focal_length = job["refine_focal"]
     models = pycolmap.incremental_mapping(database, images, root, mapping)
     if models:
