@@ -4,6 +4,7 @@ Run as a program it is `slomo` with these stages: `python fake_line.py reconstru
 variable FAKE_GATE the fit stops in its middle until that file exists.
 """
 
+import ctypes
 import dataclasses
 import os
 import time
@@ -122,6 +123,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
         raise ZeroDivisionError("a bug")
     if config.mode == "print":
         print("printed by a library")
+        ctypes.CDLL(None).puts(b"printed from C")
     total = sum(float(np.sum(a.npz["keypoints.npz"]["keypoints"])) for a in inputs.artifacts.values() if len(a.npz))
     arrays = {"keypoints": np.full((3, 2, 3), total * config.gain)}
     failure = "did not converge" if config.mode == "bad" else None

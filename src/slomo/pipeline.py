@@ -87,7 +87,7 @@ STAGES: dict[str, StageSpec] = {
         StageSpec("optimize", "slomo.optimize.stage", "optimize", upstream=("retarget",), robot=True),
         StageSpec("track", "slomo.track.stage", "track --sim", upstream=("optimize",), robot=True),
         StageSpec(
-            "report", "slomo.report.stage", "report", robot=True, inspects=True,
+            "report", "slomo.report.stage", "report", robot=True, inspects=True, optional=("truth",),
             upstream=("decode", "masks", "camera", "reconstruct", "retarget", "optimize", "track"),
         ),
     )

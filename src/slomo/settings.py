@@ -23,6 +23,7 @@ INPUTS = {
     "weights": "U2-Net-p weights (.onnx); else looked up, see `slomo doctor`",
     "skeleton": "kinematic skeleton (.toml) instead of a built-in one",
     "keypoints": "key points that `slomo import` reads instead of a clip",
+    "truth": "truth.npz of a rendered clip, against which the report scores the reconstruction",
     "motion": "what `slomo retarget` starts from when there are both: reconstruct or import",
 }
 Tables = dict[str, dict[str, Any]]
@@ -48,7 +49,7 @@ def read(root: Path, sections: list[str]) -> Tables:
     path = root / FILE
     try:
         tables = tomllib.loads(path.read_bytes().decode())
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return {}
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
         raise UsageError(f"is not TOML: {e}", where=path) from None
@@ -168,10 +169,19 @@ def edit(root: Path, changes: Tables) -> list[str]:
             was = "" if before is None else f" (was {toml_value(before)})"
             said.append(f"{FILE}: {section}.{name} = {'unset' if value is None else toml_value(value)}{was}")
     if said:
-        if {s: t for s, t in tomllib.loads(text).items() if t} != {s: t for s, t in want.items() if t}:
+        if not _holds(text, want):
             raise UsageError("cannot be edited by line", where=path, todo=f"write there yourself: {'; '.join(said)}")
         replace_file(path, text.encode())
     return said
+
+
+def _holds(text: str, want: Tables) -> bool:
+    """Whether `text` is TOML with these tables, empty ones aside."""
+    try:
+        found = tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        return False
+    return {s: t for s, t in found.items() if t} == {s: t for s, t in want.items() if t}
 
 
 def _set_line(text: str, section: str, name: str, value: Any) -> str:

@@ -8,6 +8,9 @@ import typer
 from slomo.cli.session import RobotOption, Session, command
 from slomo.errors import UsageError
 
+TruthOption = Annotated[
+    Path | None, typer.Option("--truth", help="truth.npz of a rendered clip: the report scores the reconstruction.")
+]
 KEYPOINT_SUFFIXES = (".json", ".npz")
 BUILT_IN_SKELETONS = ("quadruped", "human")
 
@@ -27,6 +30,10 @@ def _skeleton(session: Session, skeleton: str | None) -> dict[str, dict[str, Any
             f"no skeleton {skeleton!r}", where="--skeleton", valid=BUILT_IN_SKELETONS, todo="or give a .toml file"
         )
     return {"inputs": {"skeleton": session.user_path(Path(skeleton), "skeleton")}}
+
+
+def _truth(session: Session, truth: Path | None) -> dict[str, Any]:
+    return {} if truth is None else {"truth": session.user_path(truth, "truth")}
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -145,22 +152,24 @@ def add_commands(app: typer.Typer) -> None:
         session.emit_artifact(runner.make_only("track", show=not no_video))
 
     @command(app, "report", runs=True)
-    def report(session: Session, robot: RobotOption) -> None:
+    def report(session: Session, robot: RobotOption, truth: TruthOption = None) -> None:
         """Side-by-side video, plots and tables of what is there.
 
         \b
         slomo report --robot go1
         """
-        session.emit_artifact(session.runner(session.project(robot)).make_only("report"))
+        project = session.configure({"inputs": _truth(session, truth)}, robot)
+        session.emit_artifact(session.runner(project).make_only("report"))
 
     @command(app, "run", runs=True)
     def run(
         session: Session,
         robot: RobotOption,
         source: Annotated[
-            Path | None, typer.Argument(metavar="[CLIP|KEYPOINTS]", help="Default: that of the last call.")
+            Path | None, typer.Argument(metavar="CLIP|KEYPOINTS", help="Default: that of the last call.")
         ] = None,
         no_video: Annotated[bool, typer.Option("--no-video", help="Leave out the report with its video.")] = False,
+        truth: TruthOption = None,
     ) -> None:
         """Everything, from the clip (or key points) to the robot and the report. What is current is kept.
 
@@ -168,10 +177,10 @@ def add_commands(app: typer.Typer) -> None:
         slomo run cat.mp4 --robot go1
         slomo run cat00.json --robot go1
         """
-        changes: dict[str, Any] = {}
+        changes: dict[str, Any] = _truth(session, truth)
         if source is not None:
             role = "keypoints" if source.suffix in KEYPOINT_SUFFIXES else "clip"
-            changes = {role: session.user_path(source, role)}
+            changes[role] = session.user_path(source, role)
             changes["motion"] = "import" if role == "keypoints" else "reconstruct"
             if not session.given("clip" if role == "keypoints" else "keypoints"):
                 changes["motion"] = None

@@ -1,9 +1,22 @@
 """The commands beside the line: robots, doctor, synth, weights."""
 
+from pathlib import Path
+from typing import Annotated, Any
+
 import typer
 
 from slomo.cli.session import Session, command
+from slomo.console import Console
 from slomo.errors import SlomoError
+from slomo.stage import Silent
+
+
+class _Shown(Silent):
+    """Progress on the console alone."""
+
+    def __init__(self, console: Console):
+        self.update = console.update
+        self.note = console.note
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -52,3 +65,43 @@ def add_commands(app: typer.Typer) -> None:
 
         path = download_weights()
         session.emit(str(path), {"path": str(path)})
+
+    @command(app, "synth")
+    def synth(
+        session: Session,
+        out_dir: Annotated[Path, typer.Argument(help="Folder for clip.mp4, truth.npz and masks.npz.")],
+        animal: Annotated[str | None, typer.Option(metavar="dog|cat|horse", help="Default: dog.")] = None,
+        gait: Annotated[str | None, typer.Option(metavar="walk|pace|trot|stand", help="Default: walk.")] = None,
+        speed: Annotated[float | None, typer.Option(help="m/s; 0: the usual speed of the gait.")] = None,
+        turn: Annotated[float | None, typer.Option(help="Degrees a second, positive to the left.")] = None,
+        camera: Annotated[str | None, typer.Option(metavar="follow|orbit|pan|static", help="Default: follow.")] = None,
+        view: Annotated[float | None, typer.Option(help="Degrees; 0: the left flank, 90: from the front.")] = None,
+        shake: Annotated[float | None, typer.Option(help="Camera shake; 1: a hand.")] = None,
+        clutter: Annotated[bool | None, typer.Option("--clutter", help="Posts near the animal.")] = None,
+        seconds: Annotated[float | None, typer.Option(help="Length of the clip.")] = None,
+        fps: Annotated[float | None, typer.Option(help="Frames a second.")] = None,
+        width: Annotated[int | None, typer.Option(help="Pixels.")] = None,
+        height: Annotated[int | None, typer.Option(help="Pixels.")] = None,
+        noise: Annotated[float | None, typer.Option(help="Standard deviation of the sensor noise, of 255.")] = None,
+        crf: Annotated[int | None, typer.Option(help="H.264 quality; lower is better.")] = None,
+        seed: Annotated[int | None, typer.Option(help="Of the animal, the place and the hand.")] = None,
+    ) -> None:
+        """A rendered clip of an animal, with its truth.
+
+        \b
+        slomo synth trot --gait trot --seconds 3 --seed 1
+        slomo run trot/clip.mp4 --truth trot/truth.npz --robot go1
+        """
+        from slomo import settings
+        from slomo.store import writing
+        from slomo.synth.clip import Config, write_clip
+
+        given: dict[str, Any] = dict(
+            animal=animal, gait=gait, speed=speed, turn=turn, camera=camera, view=view, shake=shake, clutter=clutter,
+            seconds=seconds, fps=fps, width=width, height=height, noise=noise, crf=crf, seed=seed,
+        )  # fmt: skip
+        config = settings.make(Config, {k: v for k, v in given.items() if v is not None}, where="synth")
+        session.console.start("synth")
+        with writing(out_dir):
+            write_clip(out_dir, config, _Shown(session.console))
+        session.emit(str(out_dir.absolute()), {"path": str(out_dir.absolute()), "config": vars(config)})
