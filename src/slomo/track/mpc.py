@@ -26,15 +26,18 @@ class MpcConfig:
     """Parameters of the controller; weights as in `optimize.problem.Weights`.
 
     Attributes:
-        horizon: number of steps.  dt: s, their length.  iterations: Newton steps a tick.
+        horizon: number of steps.  dt: s, their length.
+        iterations: Newton steps a tick.
         mu: friction coefficient to plan with.  kappa: N m, smoothing of the contact.
         effort: 1/N^2, weight of the deviation from the reference's forces.
         terminal: s, weight of the end state (as if it lasted that long).
     """
 
     horizon: int = 10
-    dt: float = 0.05
+    dt: float = 0.025
     iterations: int = 2
+    tolerance: float = 1e-6
+    reg: float = 0.0
     mu: float = 0.6
     kappa: float = 1e-3
     position: float = 1000.0
@@ -52,18 +55,16 @@ class MpcConfig:
 
 
 @compiled()
-def _sample(t0, dt, qs, vs, us, t, q, v, u):
-    """State (linear, rotations along the geodesic) at t of knots t0 + k dt, velocity and input of the step that t is in.
-
-    Before the first and after the last knot the motion stands still at that knot, with the input of the nearest step.
-    """
+def _sample(knots, qs, vs, us, t, q, v, u):
+    """State at time t between knots (N + 1,): positions linear, rotations along the geodesic, and the velocity and input of
+    the step that t is in, as the integrator has them. Before the first and after the last knot it stands still there."""
     N = us.shape[0]
-    s = (t - t0) / dt
-    k = floor(s + 1e-9)
-    moving = 1.0 if 0 <= k < N else 0.0
-    k = min(max(k, 0), N)
+    k = 0
+    while k < N and t >= knots[k + 1] - 1e-9:
+        k += 1
+    moving = 1.0 if k < N and t >= knots[0] - 1e-9 else 0.0
     n = min(k + 1, N)
-    a = min(max(s - k, 0.0), 1.0)
+    a = moving * max(t - knots[k], 0.0) / (knots[n] - knots[k]) if n > k else 0.0
     w = np.empty(3)
     so3.minus(qs[n, 3:7], qs[k, 3:7], w)
     so3.plus(qs[k, 3:7], a * w[0], a * w[1], a * w[2], q[3:7])
@@ -77,12 +78,13 @@ def _sample(t0, dt, qs, vs, us, t, q, v, u):
 
 
 @compiled()
-def _sample_all(t0, dt, qs, vs, us, t, h, q_out, v_out, u_out):
-    """`_sample` at knots t + k h; velocities are those of the step that ends at the knot, as in the integrator."""
+def _sample_all(knots, qs, vs, us, t, q_out, v_out, u_out):
+    """`_sample` at times t (M + 1,): states at them, velocities and inputs in the middle of the step before."""
     u, v = np.empty(us.shape[1]), np.empty(vs.shape[1])
-    for k in range(q_out.shape[0]):
-        _sample(t0, dt, qs, vs, us, t + (k - 0.5) * h, q_out[k], v_out[k], u_out[k - 1] if k > 0 else u)
-        _sample(t0, dt, qs, vs, us, t + k * h, q_out[k], v, u)
+    for k in range(t.shape[0]):
+        before = 0.5 * (t[k] + t[k - 1]) if k > 0 else t[0] - 0.5 * (t[1] - t[0])
+        _sample(knots, qs, vs, us, before, q_out[k], v_out[k], u_out[k - 1] if k > 0 else u)
+        _sample(knots, qs, vs, us, t[k], q_out[k], v, u)
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ class Plan:
     """What the controller intends from time `t` on.
 
     Attributes:
-        t: s, when the state was measured.  dt: s.
+        t: (H + 1,) s, its knots; the first is when the state was measured.
         q (H + 1, 7 + 3 C), v (H + 1, 6 + 3 C), u (H, 3 C), lam (H, C, 3): as in `motion.Reference`.
         gains: (H, 3 C, 12 + 6 C), Riccati feedback of u on the tangent-space deviation from q, v.
         status: 0 solved, 1 the solver failed and the previous plan goes on.
@@ -117,8 +119,7 @@ class Plan:
         seconds: wall time of the solve.
     """
 
-    t: float
-    dt: float
+    t: Array
     q: Array
     v: Array
     u: Array
@@ -132,7 +133,7 @@ class Plan:
     def at(self, t: float) -> PlanPoint:
         """The plan at time t (s), between its knots; before or after them it stands still."""
         q, v, u = np.empty(self.q.shape[1]), np.empty(self.v.shape[1]), np.empty(self.u.shape[1])
-        _sample(self.t, self.dt, self.q, self.v, self.u, t, q, v, u)
+        _sample(self.t, self.q, self.v, self.u, t, q, v, u)
         return PlanPoint(
             position=q[:3],
             quat_xyzw=q[3:7],
@@ -147,15 +148,15 @@ class Plan:
     def feedback(self, t: float, q: Array, v: Array) -> Array:
         """(C, 3) N: the forces for the state that is there at time t, by the Riccati gains, within the limits."""
         qp, vp, u = np.empty(self.q.shape[1]), np.empty(self.v.shape[1]), np.empty(self.u.shape[1])
-        _sample(self.t, self.dt, self.q, self.v, self.u, t, qp, vp, u)
+        _sample(self.t, self.q, self.v, self.u, t, qp, vp, u)
         k = self._step(t)
-        a = min(max((t - self.t) / self.dt - k, 0.0), 1.0)
+        a = min(max((t - self.t[k]) / (self.t[k + 1] - self.t[k]), 0.0), 1.0)
         d = np.empty(2 * len(v))
         minus(q, v, qp, (1 - a) * self.v[k] + a * self.v[k + 1], d)
         return np.clip(u + self.gains[k] @ d, -self.u_max, self.u_max).reshape(-1, 3)
 
     def _step(self, t: float) -> int:
-        return min(max(int((t - self.t) / self.dt + 1e-9), 0), len(self.u) - 1)
+        return min(max(int(np.searchsorted(self.t, t + 1e-9)) - 1, 0), len(self.u) - 1)
 
 
 class Mpc:
@@ -182,18 +183,13 @@ class Mpc:
         w[:, :3], w[:, 3:6] = c.position, c.orientation
         w[:, 6:nv] = np.tile([c.foot, c.foot, c.foot_height], C)
         w[:, nv : nv + 3], w[:, nv + 3 : nv + 6], w[:, nv + 6 :] = c.velocity, c.angular_velocity, c.foot_velocity
-        h = np.full(H + 1, c.dt)
-        h[-1] = c.terminal
+        h = np.append(np.full(H, c.dt), c.terminal)
         self._task = Task(
             h=h, heights=np.zeros((H + 1, C)), q_ref=np.zeros((H + 1, nv + 1)), v_ref=np.zeros((H + 1, nv)),
             u_ref=np.zeros((H, 3 * C)), w_x=w, w_u=np.full((H, 3 * C), c.effort),
             w_acceleration=c.acceleration, w_slip=c.slip, slip_load=c.slip_load,
         )  # fmt: skip
-        r = reference
-        self._dt_ref = float(np.mean(r.h))
-        if not np.allclose(r.h, self._dt_ref, rtol=1e-6):
-            raise ValueError("the reference needs steps of one length")
-        self._ref = (float(r.t[0]), self._dt_ref, *(np.ascontiguousarray(x, float) for x in (r.q, r.v, r.u)))
+        self._ref = tuple(np.ascontiguousarray(x, float) for x in (reference.t, reference.q, reference.v, reference.u))
         self._hold = self._standing_forces()
         self._plan: Plan | None = None
         self._reg = 1e-6
@@ -216,7 +212,7 @@ class Mpc:
         start = time.perf_counter()
         for _ in range(2):
             plan = self.step(float(self.reference.t[0]), self.reference.q[0], self.reference.v[0])
-            plan.feedback(plan.t, plan.q[0], plan.v[0])
+            plan.feedback(float(plan.t[0]), plan.q[0], plan.v[0])
         self.reset()
         return time.perf_counter() - start
 
@@ -229,30 +225,38 @@ class Mpc:
         start = time.perf_counter()
         c, task = self.config, self._task
         H, C = c.horizon, self.model.C
-        _sample_all(*self._ref, t, c.dt, task.q_ref, task.v_ref, task.u_ref)
-        task.u_ref[t + (np.arange(H) + 0.5) * c.dt > self.reference.t[-1]] = self._hold
+        # Knots stay where they are from tick to tick, and the first step is what is left of the one under way: a contact
+        # planned at a knot comes nearer, instead of being put off by a little at every tick.
+        origin = float(self.reference.t[0])
+        knots = origin + c.dt * (np.floor((t - origin) / c.dt + 1e-6) + np.arange(H + 1))
+        knots[0] = t
+        task.h[0] = knots[1] - t
+        _sample_all(*self._ref, knots, task.q_ref, task.v_ref, task.u_ref)
+        task.u_ref[knots[1:] > self.reference.t[-1] + 1e-9] = self._hold
         last = self._plan
         it = ddp.Iterate(
             task.q_ref.copy(), task.v_ref.copy(), task.u_ref.copy(), np.zeros((H, C, 3)), np.zeros((H + 1, C, 2))
         )
         if last is not None:
             # The last plan as far as it reaches; what follows stays at the reference.
-            n = min(max(H + 1 - round((t - last.t) / c.dt + 0.5), 0), H)
+            n = int(np.searchsorted(knots, last.t[-1] + 1e-9)) - 1
             if n > 0:
-                _sample_all(last.t, c.dt, last.q, last.v, last.u, t, c.dt, it.qs[: n + 1], it.vs[: n + 1], it.us[:n])
+                _sample_all(
+                    last.t, last.q, last.v, last.u, knots[: n + 1], it.qs[: n + 1], it.vs[: n + 1], it.us[:n]
+                )
         it.qs[0], it.vs[0] = q, v
         task.heights[:] = self.terrain.height(it.qs[:, 7:].reshape(H + 1, C, 3))
         status, _, _, defect, self._reg = ddp.solve(
-            self._body, task, c.kappa, it, 1e4, False, c.iterations, 1e-9, self._reg, self._work
+            self._body, task, c.kappa, it, 1e4, False, c.iterations, c.tolerance, c.reg if c.reg > 0 else self._reg, self._work
         )
-        failed = status in (ddp.STUCK, ddp.NOT_FINITE)
+        failed = status == ddp.NOT_FINITE or (status == ddp.STUCK and not defect < 1.0)
         if failed:
             self._reg = 1e-6
         if failed and last is not None:
             plan = replace(last, status=1, seconds=time.perf_counter() - start)
         else:
             plan = Plan(
-                t=t, dt=c.dt, q=it.qs, v=it.vs, u=it.us, lam=it.lam, gains=self._work.K.copy(), u_max=self._body.u_max,
+                t=knots, q=it.qs, v=it.vs, u=it.us, lam=it.lam, gains=self._work.K.copy(), u_max=self._body.u_max,
                 status=int(failed), defect=float(defect), seconds=time.perf_counter() - start,
             )  # fmt: skip
         self._plan = plan
