@@ -20,6 +20,10 @@ from slomo.terrain import Terrain
 
 Array = np.ndarray
 
+_REG = 1e-6  # first Levenberg-Marquardt factor of every tick: one grown in an earlier tick would freeze the plan
+_DEFECT = 1.0  # l1 norm of the gaps under which an iterate that finds no further descent is a plan
+_LEG_PENALTY = 1e4  # 1/m^2
+
 
 @dataclass(frozen=True)
 class MpcConfig:
@@ -27,7 +31,7 @@ class MpcConfig:
 
     Attributes:
         horizon: number of steps.  dt: s, their length.
-        iterations: Newton steps a tick.
+        iterations: most Newton steps a tick.  tolerance: relative decrease of the cost that ends them.
         mu: friction coefficient to plan with.  kappa: N m, smoothing of the contact.
         effort: 1/N^2, weight of the deviation from the reference's forces.
         terminal: s, weight of the end state (as if it lasted that long).
@@ -35,9 +39,8 @@ class MpcConfig:
 
     horizon: int = 10
     dt: float = 0.025
-    iterations: int = 2
+    iterations: int = 4
     tolerance: float = 1e-6
-    reg: float = 0.0
     mu: float = 0.6
     kappa: float = 1e-3
     position: float = 1000.0
@@ -192,7 +195,6 @@ class Mpc:
         self._ref = tuple(np.ascontiguousarray(x, float) for x in (reference.t, reference.q, reference.v, reference.u))
         self._hold = self._standing_forces()
         self._plan: Plan | None = None
-        self._reg = 1e-6
 
     def _standing_forces(self) -> Array:
         """(3 C,) N: the weight split over the points that stand in the reference's last state."""
@@ -205,7 +207,6 @@ class Mpc:
     def reset(self) -> None:
         """Forget the last plan; the next step starts from the reference."""
         self._plan = None
-        self._reg = 1e-6
 
     def warm_up(self) -> float:
         """Compile or load everything that `step` calls, so that no tick pays for it; returns the seconds."""
@@ -241,17 +242,13 @@ class Mpc:
             # The last plan as far as it reaches; what follows stays at the reference.
             n = int(np.searchsorted(knots, last.t[-1] + 1e-9)) - 1
             if n > 0:
-                _sample_all(
-                    last.t, last.q, last.v, last.u, knots[: n + 1], it.qs[: n + 1], it.vs[: n + 1], it.us[:n]
-                )
+                _sample_all(last.t, last.q, last.v, last.u, knots[: n + 1], it.qs[: n + 1], it.vs[: n + 1], it.us[:n])
         it.qs[0], it.vs[0] = q, v
         task.heights[:] = self.terrain.height(it.qs[:, 7:].reshape(H + 1, C, 3))
-        status, _, _, defect, self._reg = ddp.solve(
-            self._body, task, c.kappa, it, 1e4, False, c.iterations, c.tolerance, c.reg if c.reg > 0 else self._reg, self._work
+        status, _, _, defect, _ = ddp.solve(
+            self._body, task, c.kappa, it, _LEG_PENALTY, False, c.iterations, c.tolerance, _REG, self._work
         )
-        failed = status == ddp.NOT_FINITE or (status == ddp.STUCK and not defect < 1.0)
-        if failed:
-            self._reg = 1e-6
+        failed = status == ddp.NOT_FINITE or (status == ddp.STUCK and not defect < _DEFECT)
         if failed and last is not None:
             plan = replace(last, status=1, seconds=time.perf_counter() - start)
         else:
