@@ -6,7 +6,6 @@ Bock, Schloeder 2005). Nothing is scheduled: which foot stands when follows from
 
 import time
 from dataclasses import dataclass, replace
-from math import floor
 
 import numpy as np
 
@@ -59,8 +58,8 @@ class MpcConfig:
 
 @compiled()
 def _sample(knots, qs, vs, us, t, q, v, u):
-    """State at time t between knots (N + 1,): positions linear, rotations along the geodesic, and the velocity and input of
-    the step that t is in, as the integrator has them. Before the first and after the last knot it stands still there."""
+    """State at time t between knots (N + 1,): positions linear, rotations along the geodesic, and the velocity and input
+    of the step that t is in, as the integrator has them. Before the first and after the last knot it stands still."""
     N = us.shape[0]
     k = 0
     while k < N and t >= knots[k + 1] - 1e-9:
@@ -96,7 +95,7 @@ class PlanPoint:
 
     Attributes:
         position: (3,) m.  quat_xyzw: (4,).  velocity: (3,) m/s.  angular_velocity: (3,) rad/s, body frame.
-        points, point_velocities: (C, 3) m, m/s.  u: (C, 3) N, of each point on the body.  lam: (C, 3) N, contact forces.
+        points, point_velocities: (C, 3) m, m/s.  u: (C, 3) N, of each point on the body.  lam: (C, 3) N, of the ground.
     """
 
     position: Array
@@ -226,10 +225,11 @@ class Mpc:
         start = time.perf_counter()
         c, task = self.config, self._task
         H, C = c.horizon, self.model.C
-        # Knots stay where they are from tick to tick, and the first step is what is left of the one under way: a contact
-        # planned at a knot comes nearer, instead of being put off by a little at every tick.
+        # Knots stay where they are from tick to tick, and the first step is what is left of the one under way: a
+        # contact planned at a knot comes nearer, instead of being put off by a little at every tick. The last fifth of a
+        # step joins the next one, because the model is stiff in very short steps.
         origin = float(self.reference.t[0])
-        knots = origin + c.dt * (np.floor((t - origin) / c.dt + 1e-6) + np.arange(H + 1))
+        knots = origin + c.dt * (np.floor((t - origin) / c.dt + 0.2) + np.arange(H + 1))
         knots[0] = t
         task.h[0] = knots[1] - t
         _sample_all(*self._ref, knots, task.q_ref, task.v_ref, task.u_ref)
