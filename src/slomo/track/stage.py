@@ -14,7 +14,7 @@ from slomo.stage import Arrays, Artifact, Inputs, Progress
 from slomo.terrain import Terrain
 from slomo.track import metrics
 from slomo.track.lead_in import with_lead_in
-from slomo.track.loop import MOTOR_HZ, Gains, run_loop
+from slomo.track.loop import JOINT_HZ, MOTOR_HZ, Gains, run_loop
 from slomo.track.mpc import Mpc, MpcConfig
 from slomo.track.simulation import Simulation
 
@@ -22,23 +22,19 @@ VERSION = 1
 
 
 @dataclass(frozen=True)
-class Config:
-    """Parameters of the controller and of the simulated world.
+class Config(MpcConfig):
+    """Parameters of `slomo track --sim`; those of the controller are those of `mpc.MpcConfig`.
 
     Attributes:
-        horizon: steps that the MPC looks ahead.
-        mpc_hz: 1/s, a divisor of 1000.
-        mpc_friction: friction coefficient that the MPC plans with, below the real one for safety.
+        mpc_hz: 1/s, a divisor of 500.
         kp: N m/rad, kd: N m s/rad, motor PD.
         lookahead: s, how far ahead of now the joints aim on the plan.
-        friction: of the simulated ground.
+        friction: of the simulated ground; the controller plans with its own `mu`.
         settle: s, standing still in the first pose.
         blend: s, gathering the first pose's velocity.
     """
 
-    horizon: int = 10
     mpc_hz: int = 100
-    mpc_friction: float = 0.6
     kp: float = 20.0
     kd: float = 1.0
     lookahead: float = 0.02
@@ -67,9 +63,9 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     for note in robot.notes:
         progress.note(f"{robot.name}: {note}")
 
-    model = PointFootModel.from_robot(robot, mu=config.mpc_friction)
+    model = PointFootModel.from_robot(robot, mu=config.mu)
     whole = with_lead_in(reference, model, terrain=terrain, settle=config.settle, blend=config.blend)
-    mpc = Mpc(model, whole, terrain=terrain, config=MpcConfig(horizon=config.horizon, mu=config.mpc_friction))
+    mpc = Mpc(model, whole, terrain=terrain, config=config)
     progress.update(0, "compiling the controller")
     compiling = mpc.warm_up()
     start = perf_counter()
@@ -112,16 +108,14 @@ def _digest(arrays: Arrays) -> str:
 
 
 def _check(config: Config) -> None:
-    if config.mpc_hz <= 0 or MOTOR_HZ % config.mpc_hz:
-        raise UsageError(f"{config.mpc_hz} does not divide {MOTOR_HZ}", where="track.mpc_hz", valid=(50, 100, 125, 200))
-    if config.horizon < 1:
-        raise UsageError(f"{config.horizon} is not a number of steps", where="track.horizon", valid=("1 or more",))
-    for name in ("mpc_friction", "kp", "friction", "blend"):
+    if config.mpc_hz <= 0 or JOINT_HZ % config.mpc_hz:
+        raise UsageError(f"{config.mpc_hz} does not divide {JOINT_HZ}", where="track.mpc_hz", valid=(50, 100, 125, 250))
+    for name in ("horizon", "dt", "iterations", "mu", "kappa", "kp", "friction", "blend"):
         if not getattr(config, name) > 0:
-            raise UsageError(f"{getattr(config, name)} is not above 0", where=f"track.{name}")
+            raise UsageError(f"needs a number above 0, got {getattr(config, name)}", where=f"track.{name}")
     for name in ("kd", "lookahead", "settle"):
         if not getattr(config, name) >= 0:
-            raise UsageError(f"{getattr(config, name)} is below 0", where=f"track.{name}")
+            raise UsageError(f"needs a number of at least 0, got {getattr(config, name)}", where=f"track.{name}")
 
 
 def _check_robot(reference: Reference, robot: Robot) -> None:

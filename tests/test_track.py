@@ -1,0 +1,177 @@
+"""Tracking: entering a motion, following it, falling, and what is reported."""
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from slomo.errors import MissingInput, UsageError
+from slomo.motion import Reference, Rollout
+from slomo.pointfoot import PointFootModel
+from slomo.robot import load_robot
+from slomo.stage import Artifact, Inputs, Silent
+from slomo.terrain import Box, Terrain
+from slomo.track import metrics
+from slomo.track.lead_in import with_lead_in
+from slomo.track.stage import Config, run
+
+H = 0.02
+
+
+def sway(robot, *, seconds=1.0, shift=0.03, jump=0.0):
+    """The body sways over standing feet, or (with a jump, m) also rises to where no leg reaches."""
+    t = np.arange(round(seconds / H) + 1) * H
+    T, w = len(t), 2 * np.pi
+    q, v = np.zeros((T, 19)), np.zeros((T, 18))
+    q[:, 6], q[:, 2] = 1.0, robot.standing_height + jump * t / seconds
+    q[:, 1], v[:, 1] = shift * np.sin(w * t), shift * w * np.cos(w * t)
+    q[:, 7:] = (robot.nominal_feet + [0, 0, robot.standing_height]).ravel()
+    u = np.tile([0.0, 0.0, robot.mass * 9.81 / 4], (T - 1, 4))
+    return Reference(t, np.full(T - 1, H), q, v, u, u.reshape(T - 1, 4, 3), robot.foot_names, robot.digest)
+
+
+def track(reference, robot, terrain=None, **config):
+    terrain = terrain or Terrain()
+    upstream = Artifact(npz={"reference.npz": reference.to_arrays()}, json={"terrain.json": terrain.to_json()})
+    return run(Inputs({"optimize": upstream}, {}, robot), Config(**config), Silent())
+
+
+@cache
+def swayed(name="go1"):
+    robot = load_robot(name)
+    return track(sway(robot), robot)
+
+
+@pytest.mark.parametrize("name", ["go1", "a1", "go2"])
+def test_sways_without_falling(name):
+    artifact = swayed(name)
+    m = artifact.json["metrics.json"]
+    assert artifact.failure is None
+    assert not m["fell"]
+    assert m["body_rmse"] < 0.02
+    assert m["foot_rmse"] < 0.02
+    assert m["orientation_rmse"] < 3
+    assert m["torque_ratio_p99"] < 1
+    assert m["state"] == "truth"
+    assert 0 < m["mpc_ms_p50"] <= m["mpc_ms_p99"]
+    assert m["missed_ticks"] >= 0
+
+
+def test_rollout_is_whole_and_in_step_with_the_reference():
+    robot = load_robot("go1")
+    r = Rollout.from_arrays(swayed().npz["rollout.npz"])
+    T = len(r.t)
+    np.testing.assert_allclose(np.diff(r.t), 0.002, atol=1e-9)
+    assert r.t[0] < 0
+    assert r.t[-1] == pytest.approx(1.0, abs=0.01)
+    shapes = dict(q=(T, 19), v=(T, 18), q_des=(T, 12), tau=(T, 12), body=(T, 7), points=(T, 4, 3), lam=(T, 4, 3))
+    assert {k: getattr(r, k).shape for k in shapes} == shapes
+    assert np.all(np.abs(r.tau) <= robot.effort + 1e-9)
+    assert r.joint_names == robot.joint_names
+    assert len(r.reference_digest) == 64
+    # The reference's world is the plane of the feet's centres.
+    np.testing.assert_allclose(r.q[:, 2] - r.body[:, 2], robot.foot_radius, atol=1e-9)
+    assert np.all(np.abs(r.points[:, :, 2]) < 0.005)
+    np.testing.assert_allclose(
+        np.interp(r.t[r.t >= 0], r.t, r.body_ref[:, 1]), 0.03 * np.sin(2 * np.pi * r.t[r.t >= 0]), atol=1e-3
+    )
+    carried = r.lam[r.t > 0].sum(axis=1)[:, 2].mean()
+    assert carried == pytest.approx(robot.mass * 9.81, rel=0.03)
+
+
+def test_same_inputs_give_the_same_rollout():
+    robot = load_robot("go1")
+    a, b = (track(sway(robot, seconds=0.3), robot).npz["rollout.npz"] for _ in range(2))
+    for name in a:
+        if name != "mpc_ms":
+            np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+
+
+def test_a_fall_is_reported_and_kept():
+    robot = load_robot("go1")
+    reference = sway(robot, seconds=1.5)
+    over = Rotation.from_euler("x", np.linspace(0, np.pi, len(reference.t))[:, None]).as_quat()
+    q = reference.q.copy()
+    q[:, 3:7] = over
+    artifact = track(dataclasses.replace(reference, q=q), robot)
+    m = artifact.json["metrics.json"]
+    assert m["fell"]
+    assert artifact.failure is not None
+    assert "fell" in artifact.failure
+    assert " s" in m["fall"]
+    assert 1.0 < len(artifact.npz["rollout.npz"]["t"]) * 0.002 < 2.4
+
+
+def test_slippery_ground_shows():
+    robot = load_robot("go1")
+    slippery = track(sway(robot, shift=0.06), robot, friction=0.02).json["metrics.json"]
+    assert slippery["fell"] or slippery["foot_rmse"] > 3 * swayed().json["metrics.json"]["foot_rmse"]
+
+
+@pytest.mark.parametrize(
+    ("config", "where"),
+    [
+        ({"mpc_hz": 333}, "track.mpc_hz"),
+        ({"kp": 0.0}, "track.kp"),
+        ({"settle": -1.0}, "track.settle"),
+        ({"horizon": 0}, "track.horizon"),
+    ],
+)
+def test_parameters_out_of_range(config, where):
+    robot = load_robot("go1")
+    with pytest.raises(UsageError, match=where):
+        track(sway(robot), robot, **config)
+
+
+def test_reference_of_another_robot():
+    with pytest.raises(MissingInput, match="optimize --robot a1"):
+        track(sway(load_robot("go1")), load_robot("a1"))
+
+
+def test_lead_in_stands_and_arrives():
+    robot = load_robot("go1")
+    model = PointFootModel.from_robot(robot)
+    terrain = Terrain((Box(0.05, 1, -1, 1, 0.1),))
+    reference = sway(robot)
+    q, v = reference.q.copy(), reference.v.copy()
+    q[:, [2, 9, 12]] += 0.1
+    q[0, 12] += 0.03  # the front right foot begins in the air
+    v[0, 9:12] = [0.8, 0.0, 0.2]
+    v[0, :6] = [0.3, 0.1, 0.05, 0.2, -0.1, 0.4]
+    reference = dataclasses.replace(reference, q=q, v=v)
+    whole = with_lead_in(reference, model, terrain=terrain, settle=0.3, blend=0.6)
+    n = int(np.sum(whole.t < 0))
+    np.testing.assert_array_equal(whole.q[n:], reference.q)
+    assert whole.t[0] == pytest.approx(-0.9, abs=H)
+    assert np.all(whole.v[0] == 0)
+    np.testing.assert_allclose(whole.points[0, :, 2], [0.1, 0.1, 0, 0], atol=1e-12)
+    still = whole.t < -0.65
+    assert np.all(np.ptp(whole.q[still], axis=0) == 0)
+    # It arrives at the reference's state: one more step of its own velocity lands there.
+    step = whole.q[n] - whole.q[n - 1]
+    np.testing.assert_allclose(step[:3], H * v[0, :3], atol=2e-3)
+    np.testing.assert_allclose(whole.v[n - 1, :6], v[0, :6], atol=0.06)
+    # Its velocities are the derivatives of its positions.
+    middle = (whole.q[2:n, :3] - whole.q[: n - 2, :3]) / (2 * H)
+    np.testing.assert_allclose(middle, whole.v[1 : n - 1, :3], atol=0.01)
+    # Standing, the forces carry the body without turning it.
+    u = whole.u[0].reshape(4, 3)
+    np.testing.assert_allclose(u.sum(axis=0), [0, 0, model.mass * 9.81], atol=1e-9)
+    np.testing.assert_allclose(np.cross(whole.points[0] - whole.q[0, :3], u).sum(axis=0), 0, atol=1e-9)
+
+
+def test_errors_of_a_known_offset():
+    r = Rollout.from_arrays(swayed().npz["rollout.npz"])
+    body = r.body_ref.copy()
+    body[:, :3] += [0.03, 0, 0.04]
+    body[:, 3:] = (Rotation.from_quat(body[:, 3:]) * Rotation.from_euler("x", 5, degrees=True)).as_quat()
+    body[r.t < 0, :3] += 100  # entering the motion does not count
+    moved = dataclasses.replace(r, body=body, points=r.points_ref + [0.0, 0.02, 0.0])
+    e = metrics.errors(moved)
+    assert e["body_rmse"] == pytest.approx(0.05)
+    assert e["foot_rmse"] == pytest.approx(0.02)
+    assert e["orientation_rmse"] == pytest.approx(5)
+    before = np.full_like(r.t, -1.0)
+    assert metrics.errors(dataclasses.replace(r, t=before))["body_rmse"] is None
