@@ -1,7 +1,7 @@
 """Kinematic skeletons as data: B links, N spherical joints, read from TOML.
 
 A skeleton is a tree of nodes. The root and the joints carry a link (a frame) each; points are fixed to a link. Every
-node is a key point of the same name. Lengths are fractions of the body length; in the rest pose every link's frame has x
+node is a key point of the same name. Lengths are fractions of the body length; at rest every link's frame has x
 forward, y left and z up. Capsules give the links their volume. Entries whose name contains "left" are mirrored.
 """
 

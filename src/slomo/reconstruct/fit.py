@@ -6,7 +6,6 @@ best go on. All of it is deterministic by the seed, and a checkpoint within any 
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
@@ -14,9 +13,9 @@ import torch
 
 from slomo.reconstruct import hypotheses
 from slomo.reconstruct.hypotheses import GaitHypothesis, RootGuess
-from slomo.reconstruct.problem import Draw, Problem, Schedule, Variables, optimise
+from slomo.reconstruct.problem import Problem, Schedule, Variables, optimise
 from slomo.reconstruct.trajectory import Guess
-from slomo.stage import Progress
+from slomo.stage import Arrays, Progress
 
 Tensor = torch.Tensor
 
@@ -107,7 +106,7 @@ def _pick(x: Variables, which: Tensor) -> Variables:
 def _to_gait(
     problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, metres: float, progress: Progress
 ) -> Run:
-    """Lay postures and gaits over the best heading (two when close), rank them as they are, keep the best and "none"."""
+    """Lay postures and gaits over the best heading (two when close), rank them as they are, keep the best few."""
     order = losses.argsort()
     keep = [int(order[0])]
     keep += [int(k) for k in order[1:2] if losses[k] < 1.15 * losses[order[0]]]
@@ -206,7 +205,7 @@ def swap_margin(log: dict) -> float | None:
     chosen = log["final"][0]
     if chosen.get("gait", "none") == "none":
         return None
-    own = next(e for e in log["gait"] if all(e.get(k) == chosen[k] for k in ("heading", "gait", "stride_hz", "phase")))
+    own = next(e for e in log["gait"] if all(e.get(k) == v for k, v in chosen.items() if k != "loss"))
     other = [
         e["loss"] for e in log["gait"]
         if e["gait"] == own["gait"] and abs(abs(e["phase"] - own["phase"]) - 0.5) < 0.13
@@ -227,11 +226,11 @@ def _arrays(run: Run, iteration: int, optimiser: torch.optim.Adam, generator: to
     return out
 
 
-def _restore(saved: "Callable | dict | None", generator: torch.Generator) -> tuple[Run | None, int, dict | None]:
+def _restore(saved: Arrays | None, generator: torch.Generator) -> tuple[Run | None, int, dict | None]:
     """Run, iteration and Adam's moments from a checkpoint; the generator is set to where it was."""
     if saved is None:
         return None, 0, None
-    z = {k: np.array(v) for k, v in saved.items()}  # type: ignore[union-attr]
+    z = {k: np.array(v) for k, v in saved.items()}
     tensor = lambda a: torch.from_numpy(a.copy())  # noqa: E731
     meta = json.loads(bytes(z["meta"]))
     x = {k[2:]: tensor(v) for k, v in z.items() if k.startswith("x.")}
@@ -243,6 +242,3 @@ def _restore(saved: "Callable | dict | None", generator: torch.Generator) -> tup
             _, n, name = k.split(".")
             state.setdefault(int(n), {})[name] = tensor(v)
     return Run(meta["phase"], x, guess, meta["labels"], meta["log"]), meta["iteration"], state
-
-
-__all__ = ["Draw", "Effort", "Run", "fit", "rank", "swap_margin"]

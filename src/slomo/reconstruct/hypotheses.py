@@ -19,11 +19,11 @@ GRAVITY = 9.81
 
 @dataclass(frozen=True)
 class GaitHypothesis:
-    """A gait with stride frequency Hz and phase in [0, 1) of the first limb's cycle at t = 0; name "none" has no cycle."""
+    """A gait with stride frequency Hz and phase in [0, 1) of the stride at t = 0."""
 
     name: str
-    frequency: float = 0.0
-    phase: float = 0.0
+    frequency: float
+    phase: float
 
 
 def whittaker(y: Array, weight: Array, smoothness: float) -> Array:

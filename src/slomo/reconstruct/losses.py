@@ -29,7 +29,7 @@ class State:
         shape: the unit-normal shape variables. tilt: (H, 2) unit-normal camera tilt.
         R_cam, centre: (H, F, 3, 3) world to camera, (H, F, 3).
         seen: frames drawn for image terms (S,), as positions among the fit frames; u, v: (S, P) px, flat index
-            `pixel`; the first `inside` of the P lie in the mask. out: outline of the capsules there; sd, h: (H, S, P, C).
+            `pixel`; the first `inside` of P lie in the mask. out: outline of the capsules there; sd, h: (H, S, P, C).
         ends: camera-frame capsule ends (H, F, C, 3) a and b.
         stance: (H, F-1, L) hypothetical contact times its present weight; negative where there is none.
     """
@@ -134,7 +134,7 @@ def carry(s: State, k: Tensor, c: Tensor, X: Tensor) -> Tensor:
 
 
 def feet(s: State) -> tuple[Tensor, Tensor, Tensor]:
-    """Height above stance height (H, F, L), velocity to the next fit frame (H, F-1, L, 3), both in body lengths (and s),
+    """Height above stance height (H, F, L), velocity to the next fit frame (H, F-1, L, 3), in body lengths (and s),
     and place (H, F, L, 3) in the world."""
     L = s.body.length[:, None, None]
     x = s.body.nodes[:, :, s.kin.contacts]
@@ -204,7 +204,7 @@ def limits(s: State) -> Tensor:
 
 
 def forward(s: State) -> Tensor:
-    """Animals and people mostly move the way they face: sideways and backward speed in half body lengths / s, robust."""
+    """Animals and people mostly move the way they face: sideways and backward speed, half body lengths / s, robust."""
     p, L = s.body.nodes[:, :, 0, :2], s.body.length[:, None, None]
     v = (p[:, 1:] - p[:, :-1]) / L / s.obs.dt[:, None]
     ahead = s.R_root[:, :-1, :2, 0]

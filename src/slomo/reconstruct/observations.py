@@ -105,7 +105,7 @@ def observe(
     outside = np.stack(
         [cv2.distanceTransform((~m).astype(np.uint8), cv2.DIST_L2, 3) if m.any() else np.zeros((h, w)) for m in mask]
     )
-    empty = ~mask.any((1, 2))
+    empty = np.array([not m.any() for m in mask])
     box = np.array([[0, 0, 0, 0] if not m.any() else _box(m) for m in mask], float)
     # Thin parts (legs) are drawn as often as thick ones; background is drawn near the subject and everywhere.
     draw_in = _cumulative(np.where(mask, 1 / (1 + inside), 0))
@@ -145,12 +145,17 @@ def _chain(flow: Mapping[str, Array], at: Array, width: int) -> tuple[Array, Arr
         grid = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).astype(np.float32)
         for k in range(a + 1, b):
             at_k = grid + total
-            total = total + cv2.remap(np.asarray(flow["flow"][k], np.float32), at_k, None, cv2.INTER_LINEAR)
+            total = total + _at(np.asarray(flow["flow"][k], np.float32), at_k)
             ok_k = np.unpackbits(flow["consistent"][k], axis=-1)[:, :width].astype(np.float32)
-            ok = ok * cv2.remap(ok_k, at_k, None, cv2.INTER_LINEAR)
+            ok = ok * _at(ok_k, at_k)
         out.append(total)
         ok_out.append(ok > 0.5)
     return np.stack(out), np.stack(ok_out)
+
+
+def _at(image: Array, uv: Array) -> Array:
+    """Values of an image at the places uv (H, W, 2) px, bilinear."""
+    return cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR)
 
 
 def ground_points(K: Intrinsics, T_world_cam: Array, u: Array, v: Array) -> Array:

@@ -62,7 +62,7 @@ def assess(problem: Problem, run: fitting.Run, metres: float) -> Outcome:
         "search": run.log,
         "foot_skate_mps": round(_skate(feet, contact, obs.t.numpy()), 4),
         "metres_per_unit": round(per_unit, 5),
-        "tilt_deg": [round(float(np.degrees(a)), 2) for a in run.x["tilt"][0] * problem.tilt_spread],
+        "tilt_deg": np.degrees(run.x["tilt"][0].numpy() * problem.tilt_spread).round(2).tolist(),
         "fit_frames": len(obs.at),
         "working_size": [obs.K.width, obs.K.height],
     }

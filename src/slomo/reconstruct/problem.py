@@ -17,7 +17,7 @@ Variables = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class Draw:
-    """Pixels of one evaluation: frames `seen` (S,) among the fit frames, flat indices (S, P), first `inside` of mask."""
+    """Pixels of one evaluation: fit frames `seen` (S,), flat indices (S, P), the first `inside` of them in the mask."""
 
     seen: Tensor
     pixel: Tensor
@@ -141,7 +141,7 @@ def optimise(
     """
     optimiser = adam(x, schedule.learn)
     if adam_state is not None:
-        optimiser.load_state_dict(adam_state)
+        optimiser.load_state_dict(optimiser.state_dict() | {"state": adam_state})
     n = schedule.iterations
     for i in range(start, n):
         decay = 0.1 + 0.45 * (1 + np.cos(np.pi * i / n))

@@ -58,7 +58,7 @@ def outline(K: Intrinsics, a: Tensor, b: Tensor, radii: Tensor) -> Outline:
 
 
 class _Distance(torch.autograd.Function):
-    """Signed distance px and place along the axis, with the gradient written out: autograd would keep twenty such arrays.
+    """Signed distance px and place along the axis, with the gradient written out (autograd would keep twenty arrays).
 
     The place h on the axis is the closest one, so its own change does not change the distance to the axis (envelope
     theorem); that it changes the radius of a tapered capsule a little is left out of the gradient.

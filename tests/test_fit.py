@@ -1,0 +1,195 @@
+"""The whole fit on a walk of the skeleton itself: it must find it, resume to the same bits, and say when it cannot."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from slomo.errors import InvalidData, UsageError
+from slomo.motion import KeypointMotion
+from slomo.reconstruct import hypotheses, silhouette
+from slomo.reconstruct.fit_stage import FitConfig, run_fit
+from slomo.reconstruct.hypotheses import GaitHypothesis
+from slomo.reconstruct.kinematics import Kinematics
+from slomo.reconstruct.silhouette import Intrinsics
+from slomo.rotation import umeyama
+from slomo.skeleton import load_skeleton
+from slomo.stage import Artifact, Inputs, Silent
+
+T, FPS, LENGTH = 24, 12.0, 0.45
+K = Intrinsics(150, 150, 79.5, 44.5, 160, 90)
+QUICK = FitConfig(iterations=(40, 40, 20, 120), candidates=4, gait_phases=6, fps=12)
+TINY = FitConfig(iterations=(6, 4, 4, 6), candidates=3, gait_phases=2, fps=6)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def _camera() -> np.ndarray:
+    """A camera one unit above the ground that looks along y, 12 degrees down."""
+    c, s = np.cos(np.radians(12)), np.sin(np.radians(12))
+    M = np.eye(4)
+    M[:3, :3] = np.array([[1, 0, 0], [0, -s, c], [0, -c, -s]])
+    M[2, 3] = 1.0
+    return M
+
+
+def _walk() -> tuple[np.ndarray, dict, dict]:
+    """True nodes (T, M, 3), masks and flow of a walk to the right, drawn with the capsules."""
+    kin = Kinematics(load_skeleton("quadruped"))
+    t = np.arange(T) / FPS
+    walk = next(g for g in kin.skeleton.gaits if g.name == "walk")
+    speed = 1.1
+    gait = GaitHypothesis("walk", 1.2, 0.3)
+    q, _ = hypotheses.gait_pose(kin, walk, gait, t, speed=np.full(T, speed), leg=0.75)
+    f = lambda x: torch.as_tensor(x, dtype=torch.float32)  # noqa: E731
+    position = np.stack([-0.75 + speed * LENGTH * t, np.full(T, 2.3), np.full(T, 0.93 * LENGTH)], 1)
+    shape = kin.shape_variables(1)
+    shape["log_length"] += float(np.log(LENGTH))
+    body = kin.pose(shape, f(position)[None], torch.eye(3).expand(1, T, 3, 3), f(q)[None])
+    M = _camera()
+    R, centre = f(M[:3, :3].T).expand(1, T, 3, 3), f(M[:3, 3]).expand(1, T, 3)
+    a, b = (silhouette.to_camera(R, centre, x) for x in (body.a, body.b))
+    out = silhouette.outline(K, a, b, body.radii)
+    v, u = torch.meshgrid(torch.arange(90.0), torch.arange(160.0), indexing="ij")
+    u, v = u.reshape(1, -1).expand(T, -1), v.reshape(1, -1).expand(T, -1)
+    sd, h = silhouette.distances(out, u, v)
+    mask = (sd[0].amin(-1) < 0).reshape(T, 90, 160).numpy()
+    c, _ = silhouette.visible(K, out, sd, h)
+    X = silhouette.surface(K, out, c, u, v)[0].numpy() @ M[:3, :3].T + M[:3, 3]
+    links = kin.skeleton.capsule_link[c[0].numpy()]
+    Rw, pw = body.R[0].numpy(), body.nodes[0].numpy()
+    flow = np.zeros((T - 1, 90 * 160, 2), np.float32)
+    for i in range(T - 1):
+        local = np.einsum("nji,nj->ni", Rw[i, links[i]], X[i] - pw[i, links[i]])
+        Y = np.einsum("nij,nj->ni", Rw[i + 1, links[i]], local) + pw[i + 1, links[i]]
+        Y = (Y - M[:3, 3]) @ M[:3, :3]
+        moved = np.stack([K.fx * Y[:, 0] / Y[:, 2] + K.cx, K.fy * Y[:, 1] / Y[:, 2] + K.cy], 1)
+        flow[i] = moved - np.stack([u[0], v[0]], 1)
+    flow = flow.reshape(T - 1, 90, 160, 2) * mask[:-1, ..., None]
+    masks = dict(packed=np.packbits(mask, axis=-1), shape=np.array(mask.shape), quality=np.ones(T))
+    return pw, masks, dict(flow=flow.astype(np.float16), consistent=np.packbits(np.ones_like(mask[1:]), axis=-1))
+
+
+def _inputs(masks: dict, flow: dict) -> Inputs:
+    intrinsics = np.array([[K.fx, 0, K.cx], [0, K.fy, K.cy], [0, 0, 1]])
+    camera = dict(K=intrinsics, T_world_cam=np.tile(_camera(), (T, 1, 1)))
+    return Inputs(
+        artifacts={
+            "decode": Artifact(npz={"frames.npz": dict(t=np.arange(T) / FPS)}),
+            "masks": Artifact(npz={"masks.npz": masks, "flow.npz": flow}),
+            "camera": Artifact(npz={"camera.npz": camera}, json={"report.json": dict(mode="moving")}),
+        }
+    )
+
+
+@pytest.fixture(scope="module")
+def walk() -> tuple[np.ndarray, dict, dict]:
+    return _walk()
+
+
+def test_a_walk_is_found(walk):
+    true, masks, flow = walk
+    out = run_fit(_inputs(masks, flow), QUICK, Silent())
+    assert out.failure is None
+    report = out.json["report.json"]
+    assert report["hypothesis"]["gait"] == "walk"
+    assert report["silhouette_iou"] > 0.8
+    assert report["scale_source"] == "typical length of quadruped"
+    motion = KeypointMotion.from_arrays(out.npz["keypoints.npz"])
+    names = load_skeleton("quadruped").names
+    Y = true[:, [names.index(n) for n in motion.names]]
+    X = motion.positions
+    s, R, p = umeyama(X.reshape(-1, 3), Y.reshape(-1, 3))
+    error = np.linalg.norm(s * X @ R.T + p - Y, axis=-1)
+    assert error.mean() < 0.10 * LENGTH
+    legs = [i for i, n in enumerate(motion.names) if n.endswith("paw")]
+    swapped = [motion.names.index(motion.names[i].replace("left", "#").replace("right", "left").replace("#", "right")) for i in legs]  # fmt: skip  # noqa: E501
+    crossed = np.linalg.norm(s * X[:, swapped] @ R.T + p - Y[:, legs], axis=-1)
+    assert error[:, legs].mean() < 0.6 * crossed.mean()
+    assert np.linalg.norm(motion["withers"] - motion["tail_base"], axis=-1) == pytest.approx(0.5, abs=0.06)
+
+
+class Stops(Silent):
+    """Saves every few iterations and stops after some saves, as a killed run would."""
+
+    def __init__(self, saves: int, saved: dict | None = None):
+        self.saves, self.saved, self.count = saves, saved, 0
+
+    def checkpoint_due(self) -> bool:
+        self.count += 1
+        return self.count % 3 == 0
+
+    def save(self, state) -> None:
+        self.saved = {k: np.array(v) for k, v in state.items()}
+        self.saves -= 1
+        if self.saves == 0:
+            raise KeyboardInterrupt
+
+    def load(self):
+        return self.saved
+
+
+@pytest.mark.parametrize("saves", [1, 5])
+def test_an_interrupted_fit_resumes_to_the_same_bits(walk, saves: int):
+    _, masks, flow = walk
+    whole = run_fit(_inputs(masks, flow), TINY, Silent())
+    first = Stops(saves)
+    with pytest.raises(KeyboardInterrupt):
+        run_fit(_inputs(masks, flow), TINY, first)
+    again = run_fit(_inputs(masks, flow), TINY, Stops(99, first.saved))
+    for k, v in whole.npz["keypoints.npz"].items():
+        np.testing.assert_array_equal(again.npz["keypoints.npz"][k], v, err_msg=k)
+    assert again.json["report.json"]["search"] == whole.json["report.json"]["search"]
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_seed_others(walk):
+    _, masks, flow = walk
+    a, b, c = (
+        run_fit(_inputs(masks, flow), dataclasses.replace(TINY, seed=s), Silent()).npz["keypoints.npz"]["keypoints"]
+        for s in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(a, b)
+    assert np.abs(a - c).max() > 1e-6
+
+
+def test_a_length_sets_the_scale(walk):
+    _, masks, flow = walk
+    a, b = (run_fit(_inputs(masks, flow), dataclasses.replace(TINY, length_m=m), Silent()) for m in (0.0, 1.0))
+    ratio = b.npz["keypoints.npz"]["keypoints"] / a.npz["keypoints.npz"]["keypoints"]
+    assert np.median(ratio) == pytest.approx(2.0, rel=0.02)
+    assert b.json["report.json"]["scale_source"] == "length_m"
+
+
+def test_masks_of_something_else_fail(walk):
+    _, masks, flow = walk
+    junk = np.zeros((T, 90, 160), bool)
+    junk[:, 10:80:9, ::3] = True
+    out = run_fit(_inputs(masks | dict(packed=np.packbits(junk, axis=-1)), flow), TINY, Silent())
+    assert out.failure
+    assert "covers the subject badly" in out.failure
+
+
+def test_parts_that_disagree_are_refused(walk):
+    _, masks, flow = walk
+    with pytest.raises(InvalidData, match="disagree about the number of frames"):
+        run_fit(_inputs(masks, dict(flow, flow=flow["flow"][:-2])), TINY, Silent())
+
+
+def test_no_subject_is_refused(walk):
+    _, masks, flow = walk
+    with pytest.raises(InvalidData, match="no frame shows the subject"):
+        run_fit(_inputs(masks | dict(packed=np.zeros_like(masks["packed"])), flow), TINY, Silent())
+
+
+def test_wrong_parameters():
+    with pytest.raises(UsageError, match="length_m"):
+        FitConfig(length_m=-1)
+    with pytest.raises(UsageError, match="iterations"):
+        FitConfig(iterations=(1, 2))
