@@ -18,6 +18,7 @@ from slomo import pipeline, settings
 from slomo.cli import app
 from slomo.errors import MissingInput, UsageError
 from slomo.pipeline import STAGES, Project
+from slomo.template import template
 
 HERE = Path(__file__).parent
 FAKE = [sys.executable, str(HERE / "fake_line.py")]
@@ -83,7 +84,7 @@ def test_every_option_of_reconstruct_is_a_parameter():
 
 
 def test_a_new_projects_file_is_read_back_as_the_defaults(tmp_path):
-    text = pipeline.template()
+    text = template({s.name: (s.module, s.config) for s in STAGES.values()})
     (tmp_path / settings.FILE).write_text(text)
     assert not any(settings.read(tmp_path, list(STAGES)).values())
     uncommented = "\n".join(line.removeprefix("# ") for line in text.splitlines()[2:])

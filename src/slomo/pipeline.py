@@ -108,11 +108,6 @@ def _find_weights() -> Path | None:
     return find_weights()
 
 
-def template() -> str:
-    """A new project's slomo.toml."""
-    return settings.template({s.name: s.of_module(s.config) for s in STAGES.values()})
-
-
 @dataclass(frozen=True)
 class Identity:
     """Everything that an artifact is made from. Its digest is the artifact's key."""

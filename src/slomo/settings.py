@@ -5,11 +5,11 @@ change a result is written here too, so that the file always says how the artifa
 """
 
 import difflib
-import inspect
+import json
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -181,7 +181,8 @@ def _holds(text: str, want: Tables) -> bool:
         found = tomllib.loads(text)
     except tomllib.TOMLDecodeError:
         return False
-    return {s: t for s, t in found.items() if t} == {s: t for s, t in want.items() if t}
+    shown = [json.dumps({s: t for s, t in x.items() if t}, sort_keys=True, default=str) for x in (found, want)]
+    return shown[0] == shown[1]  # as text, for nan is not equal to itself
 
 
 def _set_line(text: str, section: str, name: str, value: Any) -> str:
@@ -204,30 +205,3 @@ def _set_line(text: str, section: str, name: str, value: Any) -> str:
     elif value is not None:
         lines.insert(start, new)
     return "\n".join(lines) + "\n"
-
-
-def template(configs: Mapping[str, type]) -> str:
-    """A slomo.toml with every parameter of every stage, commented out at its default."""
-    out = ["# Parameters of this slomo project. What is commented out shows the default.", "", "[inputs]"]
-    out += [f'# {name} = ""  # {what}' for name, what in INPUTS.items()]
-    for section, config in configs.items():
-        if not fields(config):
-            continue
-        out += ["", f"[{section}]"]
-        about = _comments(config)
-        for name, value in asdict(config()).items():
-            shown = "" if value is None else f" {toml_value(value)}"
-            out.append(f"# {name} ={shown}" + (f"  # {about[name]}" if name in about else ""))
-    return "\n".join(out) + "\n"
-
-
-def _comments(config: type) -> dict[str, str]:
-    """Field name -> what its line's comment or the record's docstring (`name: text`) says of it."""
-    names = [f.name for f in fields(config)]
-    found: dict[str, str] = {}
-    for line in (inspect.getdoc(config) or "").splitlines():
-        for chunk in re.split(r"(?<=\.)  (?=\w)", line):
-            if m := re.fullmatch(r"\s*(\w+(?:, \w+)*): (.+)", chunk):
-                found |= dict.fromkeys(m[1].split(", "), m[2])
-    found |= dict(re.findall(r"^\s+(\w+)\s*:[^#\n]*=[^#\n]*#\s*(.+)$", inspect.getsource(config), re.MULTILINE))
-    return {n: found[n] for n in names if n in found}

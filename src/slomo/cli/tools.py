@@ -15,8 +15,13 @@ class _Shown(Silent):
     """Progress on the console alone."""
 
     def __init__(self, console: Console):
-        self.update = console.update
-        self.note = console.note
+        self.console = console
+
+    def update(self, fraction: float, message: str = "") -> None:
+        self.console.update(fraction, message)
+
+    def note(self, message: str) -> None:
+        self.console.note(message)
 
 
 def add_commands(app: typer.Typer) -> None:

@@ -1,0 +1,58 @@
+"""A new project's slomo.toml: every parameter of every stage with its default and what it means."""
+
+import ast
+import fnmatch
+import importlib.util
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from slomo.settings import INPUTS, toml_value
+
+
+def template(records: Mapping[str, tuple[str, str]]) -> str:
+    """The text of the file, all parameters commented out.
+
+    Args:
+        records: section -> (module, name of its record of parameters). They are read, not imported: that takes seconds.
+    """
+    out = ["# Parameters of this slomo project. What is commented out shows the default.", "", "[inputs]"]
+    out += [f'# {name} = ""  # {what}' for name, what in INPUTS.items()]
+    for section, (module, name) in records.items():
+        entries = _entries(module, name)
+        out += ["", f"[{section}]"] if entries else []
+        out += [f"# {n} = {toml_value(default)}" + (f"  # {about}" if about else "") for n, default, about in entries]
+    return "\n".join(out) + "\n"
+
+
+def _entries(module: str, name: str) -> list[tuple[str, Any, str]]:
+    """Name, default and description of a record's fields, from its source."""
+    spec = importlib.util.find_spec(module)
+    if spec is None or spec.origin is None:
+        raise ModuleNotFoundError(f"no module {module}")
+    source = Path(spec.origin).read_text()
+    record = next(n for n in ast.parse(source).body if isinstance(n, ast.ClassDef) and n.name == name)
+    fields = {
+        n.target.id: n.value
+        for n in record.body
+        if isinstance(n, ast.AnnAssign) and isinstance(n.target, ast.Name) and n.value is not None
+    }
+    about = _described(ast.get_docstring(record) or "", fields)
+    lines = source.splitlines()
+    for field, value in fields.items():
+        if comment := lines[(value.end_lineno or 1) - 1][value.end_col_offset :].partition("#")[2].strip():
+            about[field] = comment
+    return [(field, ast.literal_eval(value), about.get(field, "")) for field, value in fields.items()]
+
+
+def _described(docstring: str, fields: Mapping[str, Any]) -> dict[str, str]:
+    """Field -> text of its `field: text`, `field, field: text` or `fie*: text` in the docstring's list of attributes."""
+    text = " ".join(docstring.partition("Attributes:\n")[2].split("\n\n")[0].split())
+    name = "(?:" + "|".join([*fields, r"\w+\*"]) + ")"
+    parts = re.split(rf"(?:^|(?<=[.;] ))({name}(?:, {name})*): ", text)
+    found: dict[str, str] = {}
+    for names, meaning in zip(parts[1::2], parts[2::2], strict=True):
+        for pattern in names.split(", "):
+            found |= dict.fromkeys(fnmatch.filter(fields, pattern), meaning.strip().rstrip(".;"))
+    return found
