@@ -19,7 +19,7 @@ from math import sqrt
 from slomo.optimize.jit import compiled
 
 
-@compiled()
+@compiled
 def contact_force(phi, v, u, m, h, mu, g, kappa, lam):
     """Contact force on a point into lam (3,), N, world.
 
@@ -38,7 +38,7 @@ def contact_force(phi, v, u, m, h, mu, g, kappa, lam):
     lam[0], lam[1], lam[2] = sx * c, sy * c, gamma
 
 
-@compiled()
+@compiled
 def contact_derivative(phi, v, u, m, h, mu, g, kappa, lam, D):
     """`contact_force` with D (3, 7), its derivative with respect to (phi, v, u)."""
     a = h * h / m
@@ -59,7 +59,8 @@ def contact_derivative(phi, v, u, m, h, mu, g, kappa, lam, D):
     D[2, 3] = h * dgamma_db
     D[2, 4] = D[2, 5] = 0.0
     D[2, 6] = -a * dgamma_db
-    # f_t = f_s c(r): df_t/df_s = c 1 - e f_s f_s^T with e = c r^4 / ((1 + r^6) cone^2); df_t/dgamma = f_s c r^6/(1+r^6)/gamma.
+    # f_t = f_s c(r): df_t/df_s = c 1 - e f_s f_s^T with e = c r^4 / ((1 + r^6) cone^2), and
+    # df_t/dgamma = f_s c r^6 / (1 + r^6) / gamma.
     e = c * r2 * r2 / ((1 + r6) * cone2)
     jxx, jxy, jyy = c - e * sx * sx, -e * sx * sy, c - e * sy * sy
     k = c * (r6 / (1 + r6)) / gamma

@@ -46,7 +46,7 @@ class Task(NamedTuple):
     slip_load: float
 
 
-@compiled()
+@compiled
 def _leg(body, q, R, c, d):
     """Vector d (3,) from foot to hip and its length."""
     for i in range(3):
@@ -56,7 +56,7 @@ def _leg(body, q, R, c, d):
     return max(sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), 1e-9)
 
 
-@compiled()
+@compiled
 def leg_violation(body, q, out):
     """out (C, 2): leg_min - length and length - leg_max, m; positive is a violation."""
     R, d = np.empty((3, 3)), np.empty(3)
@@ -67,7 +67,7 @@ def leg_violation(body, q, out):
         out[c, 1] = length - body.leg_max[c]
 
 
-@compiled()
+@compiled
 def state_cost(body, task, k, q, v, multiplier, rho):
     """Cost of a state. multiplier: (C, 2) of the leg limits.  rho: their penalty."""
     nv = v.shape[0]
@@ -93,7 +93,7 @@ def state_cost(body, task, k, q, v, multiplier, rho):
     return J
 
 
-@compiled()
+@compiled
 def state_derivative(body, task, k, q, v, multiplier, rho, Lx, Lxx):
     """Adds gradient and Gauss-Newton Hessian of `state_cost` to Lx (nx,) and Lxx (nx, nx)."""
     nv = v.shape[0]
@@ -141,7 +141,7 @@ def state_derivative(body, task, k, q, v, multiplier, rho, Lx, Lxx):
                     Lxx[index[i], index[j]] += rho * g9[i] * g9[j]
 
 
-@compiled()
+@compiled
 def input_cost(body, task, k, u, v1, lam):
     """Cost of an input: v1 (6 + 3 C,) and lam (C, 3) are what the step gives."""
     C = body.hips.shape[0]
@@ -159,7 +159,7 @@ def input_cost(body, task, k, u, v1, lam):
     return 0.5 * task.h[k] * J
 
 
-@compiled()
+@compiled
 def input_derivative(body, task, k, u, v1, lam, A, B, D, Lx, Lu, Lxx, Luu, Lux):
     """Adds gradient and Gauss-Newton Hessian of `input_cost`; A, B, D as from `dynamics.linearize`."""
     C = body.hips.shape[0]

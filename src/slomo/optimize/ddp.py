@@ -1,9 +1,9 @@
 """Gauss-Newton differential dynamic programming with multiple shooting, compiled.
 
-States and inputs are both unknown; gaps f(x_k, u_k) - x_{k+1} between the pieces are closed by the Newton steps themselves
-(Giftthaler et al., "A family of iterative Gauss-Newton shooting methods", 2018). Input limits are a box solved exactly
-in the backward pass (Tassa et al. 2014). A Levenberg-Marquardt term and an l1 merit function make every step a
-descent step. The work is linear in the number of knots.
+States and inputs are both unknown; gaps f(x_k, u_k) - x_{k+1} between the pieces are closed by the Newton steps
+themselves (Giftthaler et al., "A family of iterative Gauss-Newton shooting methods", 2018). Input limits are a box
+solved exactly in the backward pass (Tassa et al. 2014). A Levenberg-Marquardt term and an l1 merit
+function make every step a descent step. The work is linear in the number of knots.
 """
 
 from math import inf, isfinite
@@ -69,7 +69,7 @@ class Work(NamedTuple):
         )  # fmt: skip
 
 
-@compiled()
+@compiled
 def evaluate(body, task, kappa, it, rho, gap, q1, v1):
     """Cost of an iterate (its lam is written) and the l1 norm of its gaps (N, nx, written)."""
     N = it.us.shape[0]
@@ -85,9 +85,9 @@ def evaluate(body, task, kappa, it, rho, gap, q1, v1):
     return J, total
 
 
-@compiled()
+@compiled
 def backward(body, task, kappa, it, rho, reg, free_start, w):
-    """Riccati pass about an iterate whose gaps are in w.gap: gains, and the first step w.dx[0]. False: reg too small."""
+    """Riccati pass about an iterate whose gaps are in w.gap: gains and the first step w.dx[0]. False: reg too small."""
     N, nu = it.us.shape
     nx = w.dx.shape[1]
     nv = nx // 2
@@ -108,9 +108,8 @@ def backward(body, task, kappa, it, rho, reg, free_start, w):
                 Vx[i] = Lx[i]
         else:
             A, B, Lu = w.A[k], w.B[k], w.Lu[k]
-            linearize(
-                body, task.h[k], kappa, task.heights[k + 1], it.qs[k], it.vs[k], it.us[k], w.q1, w.v1, it.lam[k], A, B, w.D
-            )  # fmt: skip
+            q, v, u, height = it.qs[k], it.vs[k], it.us[k], task.heights[k + 1]
+            linearize(body, task.h[k], kappa, height, q, v, u, w.q1, w.v1, it.lam[k], A, B, w.D)
             for i in range(nx):
                 for j in range(nx):
                     Vx[i] += Vxx[i, j] * w.gap[k, j]
@@ -182,7 +181,7 @@ def backward(body, task, kappa, it, rho, reg, free_start, w):
     return True
 
 
-@compiled()
+@compiled
 def forward(body, it, w):
     """The full Newton step w.dx, w.du from w.dx[0]; returns the slope of the cost along it."""
     N, nu = it.us.shape
@@ -209,7 +208,7 @@ def forward(body, it, w):
     return slope
 
 
-@compiled()
+@compiled
 def solve(body, task, kappa, it, rho, free_start, max_iterations, tolerance, reg, w):
     """Improves an iterate in place, for one kappa and one set of multipliers.
 
@@ -273,7 +272,7 @@ def solve(body, task, kappa, it, rho, free_start, max_iterations, tolerance, reg
     return ITERATIONS, max_iterations, J, G, reg
 
 
-@compiled()
+@compiled
 def close(body, task, kappa, it, w):
     """Roll the iterate out with its feedback gains, so that its dynamics hold to rounding."""
     N, nu = it.us.shape

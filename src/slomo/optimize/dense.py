@@ -5,7 +5,7 @@ from math import sqrt
 from slomo.optimize.jit import compiled
 
 
-@compiled()
+@compiled
 def copy(source, target):
     """target = source, both (n, m)."""
     for i in range(source.shape[0]):
@@ -13,7 +13,7 @@ def copy(source, target):
             target[i, j] = source[i, j]
 
 
-@compiled()
+@compiled
 def transpose_times(A, V, out):
     """out = A^T V, skipping zeros of A: A (n, m), V (n, p), out (m, p)."""
     n, m = A.shape
@@ -29,7 +29,7 @@ def transpose_times(A, V, out):
                     out[i, j] += a * V[k, j]
 
 
-@compiled()
+@compiled
 def cholesky(H, index, n, L):
     """L (lower, n x n) of H restricted to index[:n]. False when it is not positive definite."""
     for i in range(n):
@@ -46,7 +46,7 @@ def cholesky(H, index, n, L):
     return True
 
 
-@compiled()
+@compiled
 def solve_lower(L, n, X):
     """X (n, p) <- L^-1 X, in place."""
     p = X.shape[1]
@@ -60,7 +60,7 @@ def solve_lower(L, n, X):
             X[i, j] *= a
 
 
-@compiled()
+@compiled
 def solve_upper(L, n, X):
     """X (n, p) <- L^-T X, in place."""
     p = X.shape[1]
@@ -74,9 +74,9 @@ def solve_upper(L, n, X):
             X[i, j] *= a
 
 
-@compiled()
+@compiled
 def _free_set(H, g, lower, upper, x, index, descent):
-    """Number of variables that no bound holds at x; index[:number] are they, descent[:number, 0] minus their gradient."""
+    """Number of variables that no bound holds at x: index[:number], and descent[:number, 0] minus their gradient."""
     number = 0
     for i in range(g.shape[0]):
         s = g[i]
@@ -89,7 +89,7 @@ def _free_set(H, g, lower, upper, x, index, descent):
     return number
 
 
-@compiled()
+@compiled
 def box_qp(H, g, lower, upper, x, index, L, d):
     """x = argmin (1/2) x^T H x + g^T x within lower <= x <= upper, by projected Newton steps.
 

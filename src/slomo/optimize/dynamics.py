@@ -48,7 +48,7 @@ class Body(NamedTuple):
         )
 
 
-@compiled()
+@compiled
 def _body_velocity(body, h, q, v, u, R, torque, v1):
     """v1[:6]; R (3, 3) and the torque in the body frame are returned too."""
     C = body.hips.shape[0]
@@ -76,7 +76,7 @@ def _body_velocity(body, h, q, v, u, R, torque, v1):
         v1[3 + i] = v[3 + i] + h * (J[i, 0] * ex + J[i, 1] * ey + J[i, 2] * ez)
 
 
-@compiled()
+@compiled
 def _integrate(h, q, v1, q1):
     for i in range(3):
         q1[i] = q[i] + h * v1[i]
@@ -85,7 +85,7 @@ def _integrate(h, q, v1, q1):
         q1[i] = q[i] + h * v1[i - 1]
 
 
-@compiled()
+@compiled
 def step(body, h, kappa, height, q, v, u, q1, v1, lam):
     """The next state into q1, v1 and the contact forces into lam (C, 3). height: (C,) m. u: (3 C,) N."""
     R, torque = np.empty((3, 3)), np.empty(3)
@@ -100,7 +100,7 @@ def step(body, h, kappa, height, q, v, u, q1, v1, lam):
     _integrate(h, q, v1, q1)
 
 
-@compiled()
+@compiled
 def linearize(body, h, kappa, height, q, v, u, q1, v1, lam, A, B, D):
     """`step` with A (nx, nx), B (nx, 3 C), its derivative, and D (C, 3, 7) of the contact forces.
 
@@ -196,7 +196,7 @@ def linearize(body, h, kappa, height, q, v, u, q1, v1, lam, A, B, D):
             A[3 + i, 3 + k] += E[k, i]
 
 
-@compiled()
+@compiled
 def minus(qb, vb, qa, va, out):
     """out (nx,) = the tangent vector that leads from state a to state b."""
     nv = va.shape[0]
@@ -209,7 +209,7 @@ def minus(qb, vb, qa, va, out):
         out[nv + i] = vb[i] - va[i]
 
 
-@compiled()
+@compiled
 def plus(q, v, dx, alpha, q1, v1):
     """q1, v1 = the state (q, v) moved along alpha dx."""
     nv = v.shape[0]

@@ -1,11 +1,16 @@
-"""How this package's inner loops are compiled: LLVM through Numba, once, then from a cache on disk.
+"""How this package's inner loops are compiled: LLVM through Numba, once (half a minute), then from a cache on disk.
 
 Array-to-array assignments (`a[:] = b`) and NumPy functions are left out of compiled code: each one compiles Numba's
-broadcasting with its error messages, which triples the time of the first run.
+broadcasting with its error messages. Numba renews a cached function when its own file changes, not when a function
+that it calls does: after editing a file here, remove `__pycache__`.
 """
 
-from functools import partial
+from collections.abc import Callable
+from typing import Any
 
 from numba import njit
 
-compiled = partial(njit, cache=True, error_model="numpy", no_cfunc_wrapper=True)
+
+def compiled(function: Callable[..., Any]) -> Any:
+    """Decorator: compile without the Python interpreter, cached."""
+    return njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)(function)  # pyright: ignore[reportCallIssue]

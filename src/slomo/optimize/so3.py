@@ -8,7 +8,7 @@ from math import atan2, cos, sin, sqrt
 from slomo.optimize.jit import compiled
 
 
-@compiled()
+@compiled
 def matrix(quat_xyzw, R):
     """Rotation matrix of a unit quaternion into R (3, 3)."""
     x, y, z, w = quat_xyzw[0], quat_xyzw[1], quat_xyzw[2], quat_xyzw[3]
@@ -23,7 +23,7 @@ def matrix(quat_xyzw, R):
     R[2, 2] = 1 - 2 * (x * x + y * y)
 
 
-@compiled()
+@compiled
 def plus(a, wx, wy, wz, out):
     """out = a * exp(w), normalised."""
     angle2 = wx * wx + wy * wy + wz * wz
@@ -38,7 +38,7 @@ def plus(a, wx, wy, wz, out):
     out[0], out[1], out[2], out[3] = o0 * n, o1 * n, o2 * n, o3 * n
 
 
-@compiled()
+@compiled
 def minus(b, a, out):
     """out (3,) = log(a^-1 b): the tangent vector that leads from a to b, of length at most pi."""
     x = a[3] * b[0] - a[0] * b[3] - a[1] * b[2] + a[2] * b[1]
@@ -52,7 +52,7 @@ def minus(b, a, out):
     out[0], out[1], out[2] = s * x, s * y, s * z
 
 
-@compiled()
+@compiled
 def _series(w, J, alpha, beta):
     """J = 1 + alpha [w] + beta [w]^2."""
     x, y, z = w[0], w[1], w[2]
@@ -67,7 +67,7 @@ def _series(w, J, alpha, beta):
     J[2, 1] = beta * y * z + alpha * x
 
 
-@compiled()
+@compiled
 def exp_matrix(w, R):
     """R (3, 3) = exp([w])."""
     a2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
@@ -78,7 +78,7 @@ def exp_matrix(w, R):
         _series(w, R, 1 - a2 / 6, 0.5 - a2 / 24)
 
 
-@compiled()
+@compiled
 def right_jacobian(w, J):
     """J (3, 3): exp(w + d) = exp(w) exp(J d) to first order (Sola 143)."""
     a2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
@@ -89,7 +89,7 @@ def right_jacobian(w, J):
         _series(w, J, -0.5 + a2 / 24, 1 / 6 - a2 / 120)
 
 
-@compiled()
+@compiled
 def right_jacobian_inverse(w, J):
     """J (3, 3): log(exp(w) exp(d)) = w + J d to first order (Sola 144)."""
     a2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]

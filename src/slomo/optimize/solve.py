@@ -110,7 +110,7 @@ def solve(
         last = n == len(s.kappas) - 1
         for turn in range(s.rounds if last else 1):
             report((n + turn / s.rounds) / len(s.kappas), f"kappa {kappa:g} N m, leg limits round {turn + 1}")
-            status, count, cost, gap, reg = ddp.solve(
+            status, count, cost, _, reg = ddp.solve(
                 body, task, kappa, it, rho, True, s.iterations, s.tolerance, max(reg, 1e-6), work
             )
             iterations += count

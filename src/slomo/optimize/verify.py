@@ -1,7 +1,7 @@
 """Checks a reference against the model's equations and limits. Shares no code with the solver: plain NumPy.
 
-Every check is a number with a limit; `Check.holds` is a comparison. Forces, gaps and slips of step k are judged where the
-step ends, at knot k + 1, which is where an implicit contact model applies its force.
+Every check is a number with a limit; `Check.holds` is a comparison. Forces, gaps and slips of step k are judged where
+the step ends, at knot k + 1, which is where an implicit contact model applies its force.
 """
 
 from dataclasses import dataclass
@@ -53,9 +53,11 @@ def verify(
     """All checks by name; the reference is verified when every one holds.
 
     dynamics_residual: defect of one semi-implicit step, in m, rad, m/s and rad/s alike.
-    complementarity: gap times normal force, N m.  penetration: m.  friction: N beyond the cone.  pull: N, negative normal force.
-    slip_per_second: horizontal path of all points while they are loaded (normal force over 1 N), m per s of motion.
-    input_ratio: |u| / u_max.  leg_length: m beyond the limits.  torque_ratio: |J^T u| / limit of the joints (with a robot).
+    complementarity: gap times normal force, N m.  penetration: m.
+    friction_violation: N, tangential force beyond the cone.  pull: N, negative normal force.
+    slip_per_second: horizontal path of all points together while they are loaded (normal force over 1 N), m per s.
+    input_ratio: |u| / u_max.  leg_length: m beyond the limits.
+    torque_ratio: |J^T u| / limit of the joints (with a robot).
     """
     r, names = reference, model.names
     body = _dynamics(model, r)

@@ -56,10 +56,10 @@ class MpcConfig:
     terminal: float = 0.1
 
 
-@compiled()
+@compiled
 def _sample(knots, qs, vs, us, t, q, v, u):
-    """State at time t between knots (N + 1,): positions linear, rotations along the geodesic, and the velocity and input
-    of the step that t is in, as the integrator has them. Before the first and after the last knot it stands still."""
+    """State at time t between knots (N + 1,), by linear interpolation (rotations along the geodesic), and the velocity
+    and input of the step that t is in, as the integrator has them. Outside of the knots it stands still."""
     N = us.shape[0]
     k = 0
     while k < N and t >= knots[k + 1] - 1e-9:
@@ -79,7 +79,7 @@ def _sample(knots, qs, vs, us, t, q, v, u):
         u[i] = us[min(k, N - 1), i]
 
 
-@compiled()
+@compiled
 def _sample_all(knots, qs, vs, us, t, q_out, v_out, u_out):
     """`_sample` at times t (M + 1,): states at them, velocities and inputs in the middle of the step before."""
     u, v = np.empty(us.shape[1]), np.empty(vs.shape[1])
@@ -191,7 +191,10 @@ class Mpc:
             u_ref=np.zeros((H, 3 * C)), w_x=w, w_u=np.full((H, 3 * C), c.effort),
             w_acceleration=c.acceleration, w_slip=c.slip, slip_load=c.slip_load,
         )  # fmt: skip
-        self._ref = tuple(np.ascontiguousarray(x, float) for x in (reference.t, reference.q, reference.v, reference.u))
+        r = reference
+        self._t_ref, self._q_ref, self._v_ref, self._u_ref = (
+            np.ascontiguousarray(x, float) for x in (r.t, r.q, r.v, r.u)
+        )
         self._hold = self._standing_forces()
         self._plan: Plan | None = None
 
@@ -226,13 +229,13 @@ class Mpc:
         c, task = self.config, self._task
         H, C = c.horizon, self.model.C
         # Knots stay where they are from tick to tick, and the first step is what is left of the one under way: a
-        # contact planned at a knot comes nearer, instead of being put off by a little at every tick. The last fifth of a
-        # step joins the next one, because the model is stiff in very short steps.
+        # contact planned at a knot comes nearer, instead of being put off by a little at every tick. The last fifth of
+        # a step joins the next one, because the model is stiff in very short steps.
         origin = float(self.reference.t[0])
         knots = origin + c.dt * (np.floor((t - origin) / c.dt + 0.2) + np.arange(H + 1))
         knots[0] = t
         task.h[0] = knots[1] - t
-        _sample_all(*self._ref, knots, task.q_ref, task.v_ref, task.u_ref)
+        _sample_all(self._t_ref, self._q_ref, self._v_ref, self._u_ref, knots, task.q_ref, task.v_ref, task.u_ref)
         task.u_ref[knots[1:] > self.reference.t[-1] + 1e-9] = self._hold
         last = self._plan
         it = ddp.Iterate(

@@ -1,0 +1,288 @@
+"""Contact, dynamics and cost: known answers, and every derivative against finite differences and CasADi."""
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from slomo.errors import InvalidData
+from slomo.optimize import cost, ddp, dynamics, so3
+from slomo.optimize.contact import contact_derivative, contact_force
+from slomo.optimize.dense import box_qp
+from slomo.optimize.dynamics import Body
+from slomo.pointfoot import PointFootModel
+from slomo.robot import load_robot
+
+HIPS = np.array([[0.188, 0.1268, 0], [0.188, -0.1268, 0], [-0.188, 0.1268, 0], [-0.188, -0.1268, 0]])
+
+
+def make_model(C=4, **changes) -> PointFootModel:
+    hips = HIPS if C == 4 else np.random.default_rng(0).normal(0, 0.2, (C, 3))
+    values = dict(
+        mass=11.7, inertia=np.diag([0.10, 0.30, 0.36]), hips=hips, leg_min=np.full(C, 0.10), leg_max=np.full(C, 0.385),
+        foot_mass=np.full(C, 0.35), u_max=np.full((C, 3), 120.0), names=tuple(f"leg{c}" for c in range(C)),
+    )  # fmt: skip
+    return PointFootModel(**(values | changes))
+
+
+def random_state(rng, C):
+    q, v = rng.normal(0, 0.3, 7 + 3 * C), rng.normal(0, 1, 6 + 3 * C)
+    q[3:7] = Rotation.random(rng=rng).as_quat()
+    q[9::3] = rng.choice([0.0005, 0.01, 0.2], C)
+    return q, v, rng.normal(0, 20, 3 * C)
+
+
+def numerical(f, x, eps=1e-6):
+    return np.stack([(f(x + d) - f(x - d)) / (2 * eps) for d in eps * np.eye(len(x))], axis=-1)
+
+
+def test_contact_keeps_relaxed_complementarity_and_the_cone():
+    rng = np.random.default_rng(1)
+    m, h, mu, g, kappa = 0.35, 0.05, 0.6, 9.81, 1e-3
+    lam = np.zeros(3)
+    for _ in range(200):
+        phi, v, u = rng.uniform(0, 0.1), rng.normal(0, 1, 3), rng.normal(0, 60, 3)
+        contact_force(phi, v, u, m, h, mu, g, kappa, lam)
+        phi1 = phi + h * (v[2] + h * ((lam[2] - u[2]) / m - g))
+        assert lam[2] > 0
+        assert phi1 > 0
+        assert lam[2] * phi1 == pytest.approx(kappa, rel=1e-6)
+        assert np.hypot(lam[0], lam[1]) <= mu * lam[2] * (1 + 1e-12)
+
+
+def test_contact_known_answers():
+    m, h, g = 0.35, 0.01, 9.81
+    lam = np.zeros(3)
+    # A resting point under load carries load and weight; friction below the cone holds it, beyond it saturates.
+    contact_force(0.0, np.zeros(3), np.array([5.0, 0.0, 30.0]), m, h, 0.6, g, 1e-10, lam)
+    assert lam[2] == pytest.approx(30 + m * g, rel=1e-6)
+    assert lam[0] == pytest.approx(5.0, rel=1e-3)
+    contact_force(0.0, np.zeros(3), np.array([50.0, 0.0, 30.0]), m, h, 0.6, g, 1e-10, lam)
+    assert lam[0] == pytest.approx(0.6 * lam[2], rel=1e-2)
+    # Far from the ground there is nothing.
+    contact_force(1.0, np.zeros(3), np.zeros(3), m, h, 0.6, g, 1e-6, lam)
+    assert np.abs(lam).max() < 2e-6
+
+
+def test_contact_derivative():
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        x = np.concatenate([[rng.uniform(0, 0.02)], rng.normal(0, 0.5, 3), rng.normal(0, 20, 3)])
+
+        def force(x):
+            lam = np.zeros(3)
+            contact_force(x[0], x[1:4], x[4:7], 0.35, 0.05, 0.6, 9.81, 1e-2, lam)
+            return lam
+
+        D, lam = np.full((3, 7), np.nan), np.zeros(3)
+        contact_derivative(x[0], x[1:4].copy(), x[4:].copy(), 0.35, 0.05, 0.6, 9.81, 1e-2, lam, D)
+        assert np.allclose(lam, force(x), atol=1e-12)
+        assert np.allclose(D, numerical(force, x), atol=1e-5 * (1 + np.abs(D).max()))
+
+
+def test_rotations_against_scipy():
+    rng = np.random.default_rng(3)
+    for size in (1e-7, 0.1, 3.0):
+        a, w = Rotation.random(rng=rng), rng.normal(size=3)
+        w *= size / np.linalg.norm(w)
+        out, back, R, J, Ji = np.zeros(4), np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+        so3.plus(a.as_quat(), *w, out)
+        assert np.allclose(Rotation.from_quat(out).as_matrix(), (a * Rotation.from_rotvec(w)).as_matrix(), atol=1e-12)
+        so3.minus(out, a.as_quat(), back)
+        assert np.allclose(back, w, atol=1e-9)
+        so3.exp_matrix(w, R)
+        assert np.allclose(R, Rotation.from_rotvec(w).as_matrix(), atol=1e-10)
+        so3.right_jacobian(w, J)
+        so3.right_jacobian_inverse(w, Ji)
+        assert np.allclose(J @ Ji, np.eye(3), atol=1e-7)
+        E = Rotation.from_rotvec(w)
+        assert np.allclose(
+            J,
+            numerical(lambda d, E=E, w=w: (E.inv() * Rotation.from_rotvec(w + d)).as_rotvec(), np.zeros(3)),
+            atol=1e-6,
+        )
+
+
+@pytest.mark.parametrize("C", [4, 6])
+def test_dynamics_derivative(C):
+    model, rng = make_model(C), np.random.default_rng(4)
+    body, nv = Body.of(model), 6 + 3 * C
+    for _ in range(4):
+        q, v, u = random_state(rng, C)
+        height = np.zeros(C)
+        A, B, D = np.zeros((2 * nv, 2 * nv)), np.zeros((2 * nv, 3 * C)), np.zeros((C, 3, 7))
+        q0, v0, lam = np.zeros(nv + 1), np.zeros(nv), np.zeros((C, 3))
+        dynamics.linearize(body, 0.05, 1e-2, height, q, v, u, q0, v0, lam, A, B, D)
+
+        def after(d, q=q, v=v, u=u, q0=q0, v0=v0, height=height):
+            qa, va, q1, v1, out = np.zeros(nv + 1), np.zeros(nv), np.zeros(nv + 1), np.zeros(nv), np.zeros(2 * nv)
+            dynamics.plus(q, v, d[: 2 * nv], 1.0, qa, va)
+            dynamics.step(body, 0.05, 1e-2, height, qa, va, u + d[2 * nv :], q1, v1, np.zeros((C, 3)))
+            dynamics.minus(q1, v1, q0, v0, out)
+            return out
+
+        N = numerical(after, np.zeros(2 * nv + 3 * C))
+        assert np.allclose(after(np.zeros(2 * nv + 3 * C)), 0, atol=1e-12)
+        assert np.allclose(np.hstack([A, B]), N, atol=2e-5 * np.abs(N).max())
+
+
+def casadi_step(model, h, kappa):
+    """Velocities after one step as a CasADi function of (q, v, u), written from the equations."""
+    C = model.C
+    q, v, u = ca.SX.sym("q", 7 + 3 * C), ca.SX.sym("v", 6 + 3 * C), ca.SX.sym("u", 3 * C)
+    x, y, z, w = (q[i] for i in range(3, 7))
+    R = ca.vertcat(
+        ca.horzcat(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        ca.horzcat(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        ca.horzcat(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    force, torque, feet = ca.SX.zeros(3), ca.SX.zeros(3), []
+    for c in range(C):
+        uc, f, vf, m = u[3 * c : 3 * c + 3], q[7 + 3 * c : 10 + 3 * c], v[6 + 3 * c : 9 + 3 * c], model.foot_mass[c]
+        force, torque = force + uc, torque + ca.cross(f - q[:3], uc)
+        free = vf + h * (-uc / m - ca.vertcat(0, 0, model.g))
+        a, b = h**2 / m, f[2] + h * free[2]
+        gamma = (-b + ca.sqrt(b**2 + 4 * a * kappa)) / (2 * a)
+        s = -m / h * free[:2]
+        t = s * (1 + (ca.norm_2(s) / (model.mu * gamma)) ** 6) ** (-1 / 6)
+        feet.append(free + h / m * ca.vertcat(t, gamma))
+    inertia = ca.DM(model.inertia)
+    spin = ca.solve(inertia, R.T @ torque - ca.cross(v[3:6], inertia @ v[3:6]))
+    v1 = ca.vertcat(v[:3] + h * (force / model.mass - ca.vertcat(0, 0, model.g)), v[3:6] + h * spin, *feet)
+    return ca.Function("step", [q, v, u], [v1, ca.jacobian(v1, v), ca.jacobian(v1, u)])
+
+
+def test_dynamics_against_casadi():
+    model, rng = make_model(), np.random.default_rng(5)
+    body, f = Body.of(model), casadi_step(model, 0.05, 1e-2)
+    for _ in range(5):
+        q, v, u = random_state(rng, 4)
+        A, B, D = np.zeros((36, 36)), np.zeros((36, 12)), np.zeros((4, 3, 7))
+        q1, v1 = np.zeros(19), np.zeros(18)
+        dynamics.linearize(body, 0.05, 1e-2, np.zeros(4), q, v, u, q1, v1, np.zeros((4, 3)), A, B, D)
+        expected, by_v, by_u = (np.array(x) for x in f(q, v, u))
+        assert np.allclose(v1, expected[:, 0], atol=1e-9)
+        assert np.allclose(A[18:, 18:], by_v, atol=1e-8)
+        assert np.allclose(B[18:], by_u, atol=1e-8)
+
+
+def test_free_fall_and_standing():
+    model = make_model()
+    body = Body.of(model)
+    q, v = np.zeros(19), np.zeros(18)
+    q[2], q[6], q[7:] = 10.0, 1.0, (HIPS + [0, 0, 9.8]).ravel()
+    lam = np.zeros((4, 3))
+    for _ in range(100):
+        dynamics.step(body, 0.01, 1e-8, np.zeros(4), q.copy(), v.copy(), np.zeros(12), q, v, lam)
+    assert v[2] == pytest.approx(-9.81, rel=1e-9)
+    assert v[8] == pytest.approx(-9.81, rel=1e-6)
+    # Standing: the ground carries the whole weight and nothing moves.
+    q, v, u = np.zeros(19), np.zeros(18), np.zeros((4, 3))
+    q[2], q[6], q[7:], u[:, 2] = 0.28, 1.0, HIPS.ravel(), model.mass * model.g / 4
+    for _ in range(100):
+        dynamics.step(body, 0.01, 1e-8, np.zeros(4), q.copy(), v.copy(), u.ravel(), q, v, lam)
+    assert lam[:, 2].sum() == pytest.approx(model.total_mass * model.g, rel=1e-4)
+    assert np.abs(v).max() < 1e-3
+
+
+def make_task(rng, C, N=2):
+    nv = 6 + 3 * C
+    q = np.stack([random_state(rng, C)[0] for _ in range(N + 1)])
+    return cost.Task(
+        h=np.full(N + 1, 0.05), heights=np.zeros((N + 1, C)), q_ref=q, v_ref=rng.normal(size=(N + 1, nv)),
+        u_ref=rng.normal(size=(N, 3 * C)), w_x=rng.uniform(0, 5, (N + 1, 2 * nv)), w_u=rng.uniform(0, 1e-2, (N, 3 * C)),
+        w_acceleration=0.3, w_slip=4.0, slip_load=2.0,
+    )  # fmt: skip
+
+
+def test_cost_derivatives():
+    C, nv = 4, 18
+    rng = np.random.default_rng(6)
+    body, task = Body.of(make_model()), make_task(rng, C)
+    multiplier, rho = rng.uniform(0, 5, (C, 2)), 30.0
+    for _ in range(4):
+        q, v, u = random_state(rng, C)
+
+        def total(d, q=q, v=v, u=u):
+            qa, va, q1, v1, lam = np.zeros(19), np.zeros(18), np.zeros(19), np.zeros(18), np.zeros((C, 3))
+            dynamics.plus(q, v, d[:36], 1.0, qa, va)
+            ua = u + d[36:]
+            dynamics.step(body, 0.05, 1e-2, np.zeros(C), qa, va, ua, q1, v1, lam)
+            state = cost.state_cost(body, task, 0, qa, va, multiplier, rho)
+            return np.array([state + cost.input_cost(body, task, 0, ua, v1, lam)])
+
+        A, B, D = np.zeros((36, 36)), np.zeros((36, 12)), np.zeros((C, 3, 7))
+        q1, v1, lam = np.zeros(19), np.zeros(18), np.zeros((C, 3))
+        dynamics.linearize(body, 0.05, 1e-2, np.zeros(C), q, v, u, q1, v1, lam, A, B, D)
+        Lx, Lu, Lxx = np.zeros(2 * nv), np.zeros(12), np.zeros((36, 36))
+        Luu, Lux = np.zeros((12, 12)), np.zeros((12, 36))
+        cost.state_derivative(body, task, 0, q, v, multiplier, rho, Lx, Lxx)
+        cost.input_derivative(body, task, 0, u, v1, lam, A, B, D, Lx, Lu, Lxx, Luu, Lux)
+        g = numerical(total, np.zeros(48), eps=1e-5)[0]
+        assert np.allclose(np.concatenate([Lx, Lu]), g, atol=1e-5 * np.abs(g).max())
+        H = np.block([[Lxx, Lux.T], [Lux, Luu]])
+        assert np.allclose(H, H.T)
+        assert np.linalg.eigvalsh(H)[0] > -1e-9 * np.linalg.eigvalsh(H)[-1]
+
+
+def test_box_qp_satisfies_the_optimality_conditions():
+    rng = np.random.default_rng(7)
+    for n in (3, 12):
+        for _ in range(30):
+            M = rng.normal(size=(n, n))
+            H, g = M @ M.T + 0.1 * np.eye(n), 5 * rng.normal(size=n)
+            lower, upper = -rng.uniform(0, 1, n), rng.uniform(0, 1, n)
+            x = np.zeros(n)
+            free = box_qp(H, g, lower, upper, x, np.zeros(n, int), np.zeros((n, n)), np.zeros((n, 1)))
+            grad = H @ x + g
+            assert free >= 0
+            assert np.all((x >= lower) & (x <= upper))
+            assert np.all(grad[x == lower] >= -1e-8)
+            assert np.all(grad[x == upper] <= 1e-8)
+            assert np.allclose(grad[(x > lower) & (x < upper)], 0, atol=1e-8)
+    indefinite, one = -np.eye(2), np.ones(2)
+    scratch = (np.zeros(2), np.zeros(2, int), np.eye(2), np.zeros((2, 1)))
+    assert box_qp(indefinite, one, -one, one, *scratch) == -1
+
+
+def test_newton_step_solves_the_linear_quadratic_problem():
+    """Without contact nearby and without limits, one full step closes all gaps to first order."""
+    C, N = 4, 6
+    rng = np.random.default_rng(8)
+    model = make_model(u_max=np.full((C, 3), 1e6), leg_max=np.full(C, 50.0), leg_min=np.zeros(C))
+    body, task = Body.of(model), make_task(rng, C, N)
+    q = np.tile(task.q_ref[:1], (N + 1, 1))
+    q[:, 2], q[:, 9::3] = 2.0, 1.5
+    it = ddp.Iterate(q, np.zeros((N + 1, 18)), np.zeros((N, 12)), np.zeros((N, C, 3)), np.zeros((N + 1, C, 2)))
+    w = ddp.Work.make(N, C)
+    ddp.evaluate(body, task, 1e-4, it, 1.0, w.gap, w.q1, w.v1)
+    assert ddp.backward(body, task, 1e-4, it, 1.0, 0.0, False, w)
+    ddp.forward(body, it, w)
+    # Stationarity in u of the full quadratic model, checked with costates from the linearisation.
+    defects = [w.A[k] @ w.dx[k] + w.B[k] @ w.du[k] + w.gap[k] - w.dx[k + 1] for k in range(N)]
+    assert np.abs(defects).max() < 1e-10
+    deviation = [w.k[k] + w.K[k] @ w.dx[k] - w.du[k] for k in range(N)]
+    assert np.abs(deviation).max() < 1e-9 * max(1, np.abs(w.du).max())
+
+
+def test_model_of_go1():
+    model = PointFootModel.from_robot(load_robot("go1"))
+    assert model.total_mass == pytest.approx(13.1, abs=0.1)
+    assert np.allclose(np.abs(model.hips), np.abs(HIPS), atol=2e-3)
+    assert np.all((np.diag(model.inertia) > [0.05, 0.2, 0.25]) & (np.diag(model.inertia) < [0.15, 0.45, 0.5]))
+    assert np.all((model.leg_max > 0.3) & (model.leg_max < 0.385))
+    assert np.all(model.u_max > 50)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mass": -1.0}, "positive"),
+        ({"inertia": -np.eye(3)}, "inertia"),
+        ({"leg_min": np.full(4, 0.5)}, "leg_min"),
+        ({"hips": np.zeros((3, 3))}, "hips"),
+    ],
+)
+def test_model_rejects_nonsense(changes, message):
+    with pytest.raises(InvalidData, match=message):
+        make_model(**changes)
