@@ -162,6 +162,17 @@ def test_lead_in_stands_and_arrives():
     np.testing.assert_allclose(np.cross(whole.points[0] - whole.q[0, :3], u).sum(axis=0), 0, atol=1e-9)
 
 
+def test_lead_in_of_a_motion_that_begins_in_flight():
+    robot = load_robot("go1")
+    reference = sway(robot)
+    q = reference.q.copy()
+    q[:, [2, 9, 12, 15, 18]] += 0.05
+    model = PointFootModel.from_robot(robot)
+    whole = with_lead_in(dataclasses.replace(reference, q=q), model, terrain=Terrain(), settle=0.3, blend=0.6)
+    np.testing.assert_allclose(whole.points[0, :, 2], 0, atol=1e-12)
+    assert np.all(whole.u[whole.t[:-1] == -H] == 0)
+
+
 def test_errors_of_a_known_offset():
     r = Rollout.from_arrays(swayed().npz["rollout.npz"])
     body = r.body_ref.copy()

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports]
-from scipy.spatial.transform import Rotation
 
 from slomo.robot import Robot
 from slomo.track.mpc import PlanPoint
@@ -85,7 +84,7 @@ class JointSpace:
 
     def pose(self, q_point: Array) -> Array:
         """(nq,) whole configuration with the base and the feet of a point-foot configuration (7 + 3 C,)."""
-        R = Rotation.from_quat(q_point[3:7]).as_matrix()
+        R = _matrix(q_point[3:7])
         feet = (q_point[7:].reshape(-1, 3) - q_point[:3]) @ R
         T_world_root = pin.SE3(R, q_point[:3] + self._raise) * self._T_root_base.inverse()
         return np.concatenate([pin.SE3ToXYZQUAT(T_world_root), self.solve(feet)])
@@ -113,14 +112,14 @@ class JointSpace:
             u: (C, 3) N, world, forces of the feet on the body.
             q: (nq,) where the robot is, for the Jacobian of the forces.
         """
-        R = Rotation.from_quat(target.quat_xyzw).as_matrix()
+        R = _matrix(target.quat_xyzw)
         feet = (target.points - target.position) @ R
         joints = self.solve(feet)
         _, J = self._feet_in_root(joints)
         relative = (target.point_velocities - target.velocity) @ R - np.cross(target.angular_velocity, feet)
         speeds = _damped_solve(J, (relative @ self._T_root_base.rotation.T).ravel())
         _, J_now = self._feet_in_root(q[7:])
-        R_root = Rotation.from_quat(q[3:7]).as_matrix()
+        R_root = _matrix(q[3:7])
         tau = -J_now.T @ (u @ R_root).ravel()
         return JointCommand(
             joints,
@@ -142,3 +141,9 @@ class JointSpace:
 def _damped_solve(J: Array, y: Array) -> Array:
     """x minimising |J x - y|^2 + DAMPING |x|^2."""
     return np.linalg.solve(J.T @ J + DAMPING * np.eye(J.shape[1]), J.T @ y)
+
+
+def _matrix(quat_xyzw: Array) -> Array:
+    """(3, 3) rotation; twenty times faster than SciPy's for a single one."""
+    x, y, z, w = quat_xyzw
+    return pin.Quaternion(w, x, y, z).normalized().matrix()

@@ -69,9 +69,11 @@ def with_lead_in(
 
 
 def _balance(model: PointFootModel, body: Array, points: Array, stance: Array, acceleration: Array) -> Array:
-    """(C, 3) N: least forces on the body that carry it without turning it; feet in the air hang on it."""
+    """(C, 3) N: least forces on the body that carry it without turning it; feet in the air hang on it. None in flight."""
     gravity = np.array([0.0, 0.0, model.g])
     u = -np.outer(np.where(stance, 0.0, model.foot_mass), gravity)
+    if not stance.any():
+        return np.zeros_like(u)
     arms = points - body
     wrench = np.concatenate([model.mass * (acceleration + gravity) - u.sum(axis=0), -np.cross(arms, u).sum(axis=0)])
     grasp = np.hstack([np.vstack([np.eye(3), _skew(r)]) for r in arms[stance]])

@@ -85,7 +85,7 @@ def run_loop(
             for name, x in zip(rows, row, strict=True):
                 rows[name].append(x)
             ratios.append(np.max(np.abs(asked) / robot.effort))
-            fall = _fallen(q_point, _at(reference, t), terrain, robot.standing_height, body_down)
+            fall = _fallen(q_point, _height(reference, terrain, t), terrain, robot.standing_height, body_down)
             if fall:
                 fall = f"{fall} at {t:.2f} s"
                 break
@@ -104,22 +104,27 @@ def run_loop(
     return Outcome(rollout, fall, np.array(ratios))
 
 
-def _at(reference: Reference, t: Array | float) -> Array:
-    """(..., 7 + 3 C) configuration at times t (...): linear between the knots, rotations along arcs, the ends held."""
+def _at(reference: Reference, t: Array) -> Array:
+    """(T, 7 + 3 C) configurations at times t (T,): linear between the knots, rotations along arcs, the ends held."""
     x = np.stack([np.interp(t, reference.t, column) for column in reference.q.T], axis=-1)
     turns = Slerp(reference.t, Rotation.from_quat(reference.q[:, 3:7]))
-    x[..., 3:7] = turns(np.clip(t, reference.t[0], reference.t[-1])).as_quat()
+    x[:, 3:7] = turns(np.clip(t, reference.t[0], reference.t[-1])).as_quat()
     return x
 
 
-def _fallen(q: Array, wanted: Array, terrain: Terrain, standing_height: float, body_down: bool) -> str | None:
-    """Why this point-foot pose is a fall, if it is one. A reference that lies low may be followed there."""
-    height = q[2] - terrain.height(q[:3])
-    lowest = LOWEST * min(standing_height, float(wanted[2] - terrain.height(wanted[:3])))
-    tilt = np.degrees(np.arccos(np.clip(Rotation.from_quat(q[3:7]).as_matrix()[2, 2], -1, 1)))
+def _height(reference: Reference, terrain: Terrain, t: float) -> float:
+    """m, of the reference's body over the ground at a time."""
+    p = np.array([np.interp(t, reference.t, reference.q[:, i]) for i in range(3)])
+    return float(p[2] - terrain.height(p))
+
+
+def _fallen(q: Array, wanted: float, terrain: Terrain, standing_height: float, body_down: bool) -> str | None:
+    """Why this point-foot pose is a fall, if it is one. A reference that lies low (wanted, m) may be followed there."""
+    height = float(q[2] - terrain.height(q[:3]))
+    tilt = np.degrees(np.arccos(np.clip(1 - 2 * (q[3] ** 2 + q[4] ** 2), -1, 1)))
     if body_down:
         return "the body touches the ground"
-    if height < lowest:
+    if height < LOWEST * min(standing_height, wanted):
         return f"the body is {height:.2f} m high"
     if tilt > LARGEST_TILT:
         return f"the body tilts by {tilt:.0f} degrees"
