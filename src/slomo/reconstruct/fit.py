@@ -61,7 +61,7 @@ def fit(problem: Problem, root: RootGuess, effort: Effort, *, metres: float, see
         x = problem.variables(len(names), generator)
         x["shape.log_length"] += math.log(root.length)
         run = Run(0, x, guess, [{"heading": n} for n in names])
-    total = sum(s.iterations * _cost(s) for s in effort.schedules)
+    total = total_cost(effort)
     while True:
         schedule = effort.schedules[run.phase]
         done = sum(s.iterations * _cost(s) for s in effort.schedules[: run.phase])
@@ -87,6 +87,10 @@ def fit(problem: Problem, root: RootGuess, effort: Effort, *, metres: float, see
 
 def _cost(schedule: Schedule) -> float:
     return schedule.frames * schedule.pixels + 2000
+
+
+def total_cost(effort: Effort) -> float:
+    return sum(s.iterations * _cost(s) for s in effort.schedules)
 
 
 def rank(
@@ -139,7 +143,8 @@ def _to_gait(
                 (float(v), k, g, guess.pick(torch.tensor([n])))
                 for n, (v, g) in enumerate(zip(value, chunk, strict=True))
             ]
-            progress.update(0.02 + 0.05 * i / len(grid), f"trying {len(grid)} gaits")
+            done = effort.schedules[0].iterations * _cost(effort.schedules[0])
+            progress.update(done / total_cost(effort), f"trying {len(grid)} gaits: {i}")
     entries.sort(key=lambda e: e[0])
     chosen = _diverse(entries, effort.candidates - len(keep))
     which = torch.tensor(keep + [k for _, k, _, _ in chosen])
@@ -201,7 +206,7 @@ def _to_final(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
 
 
 def swap_margin(log: dict) -> float | None:
-    """Relative loss by which the chosen gait beats its left-right opposite after the short fits; None without a gait."""
+    """Relative loss by which the chosen gait beats its left-right opposite after the short fits; None without one."""
     chosen = log["final"][0]
     if chosen.get("gait", "none") == "none":
         return None

@@ -1,10 +1,13 @@
 """The fit as a stage: artifacts of decode, masks and camera in, metric key points and a report out."""
 
+import contextlib
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 
 from slomo.errors import UsageError
 from slomo.reconstruct import fit as fitting
@@ -97,8 +100,9 @@ def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
     problem = Problem(obs, kin, path, config.weights(), float(spread))
     root = hypotheses.root_guess(obs, skeleton)
     metres = config.length_m or skeleton.typical_length
-    run = fitting.fit(problem, root, _effort(config), metres=metres, seed=config.seed, progress=progress)
-    outcome = assess(problem, run, metres)
+    with _one_thread():
+        run = fitting.fit(problem, root, _effort(config), metres=metres, seed=config.seed, progress=progress)
+        outcome = assess(problem, run, metres)
     source = "length_m" if config.length_m else f"typical length of {skeleton.name}"
     progress.note(f"size: {metres:g} m from {source}; the video alone does not tell it")
     report: dict[str, Any] = outcome.report | {
@@ -111,6 +115,18 @@ def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
     if iou < MIN_IOU:
         failure = f"the fitted body covers the subject badly (IoU {iou:.2f}, needs {MIN_IOU}); look at the masks"
     return Artifact(npz={"keypoints.npz": arrays}, json={"report.json": report}, failure=failure)
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """One torch thread: sums then round alike on every machine, and these small tensors gain nothing from two (on a busy
+    machine threads that wait for each other make it ten times slower)."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _effort(config: FitConfig) -> fitting.Effort:
