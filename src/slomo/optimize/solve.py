@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slomo.errors import StageFailed
 from slomo.optimize import ddp
 from slomo.optimize.cost import Task, leg_violation
 from slomo.optimize.dynamics import Body
@@ -21,13 +22,15 @@ class Settings:
 
     Attributes:
         kappas: N m, falling: the homotopy of the contact.
-        iterations: per kappa.  tolerance: of the relative decrease still expected.
+        iterations, early_iterations: most Newton steps at the last kappa, and at each one before, which only leads to it.
+        tolerance: of the relative decrease still expected.
         leg_penalty: 1/m^2, first penalty of the leg limits.  leg_tolerance: m, largest violation accepted.
         rounds: of the augmented Lagrangian (and of moving the ground) at the last kappa.
     """
 
-    kappas: tuple[float, ...] = (1.0, 1e-1, 1e-2, 1e-3, 1e-4)
-    iterations: int = 100
+    kappas: tuple[float, ...] = (1e-1, 1e-2, 1e-3, 1e-4)
+    iterations: int = 200
+    early_iterations: int = 50
     tolerance: float = 1e-6
     leg_penalty: float = 1e4
     leg_tolerance: float = 1e-5
@@ -95,6 +98,9 @@ def solve(
 
     The iterate that is returned satisfies the dynamics and the input limits whatever the status; leg limits and
     convergence hold when the status is "converged". `report(fraction, message)` is called between the solves.
+
+    Raises:
+        StageFailed: the start is not finite.
     """
     s = settings or Settings()
     compile_seconds = warm_up(model)
@@ -108,14 +114,15 @@ def solve(
     previous, moved = np.inf, False
     for n, kappa in enumerate(s.kappas):
         last = n == len(s.kappas) - 1
+        most = s.iterations if last else s.early_iterations
         for turn in range(s.rounds if last else 1):
             report((n + turn / s.rounds) / len(s.kappas), f"kappa {kappa:g} N m, leg limits round {turn + 1}")
             status, count, cost, _, reg = ddp.solve(
-                body, task, kappa, it, rho, True, s.iterations, s.tolerance, max(reg, 1e-6), work
+                body, task, kappa, it, rho, True, most, s.tolerance, max(reg, 1e-6), work
             )
             iterations += count
             if status == ddp.NOT_FINITE:
-                break
+                raise StageFailed("met numbers that are not finite", where="optimize", todo="check the key points")
             g = _violation(body, it)
             worst = float(max(g.max(), 0.0))
             heights = terrain.height(it.qs[:, 7:].reshape(-1, C, 3))
@@ -129,9 +136,8 @@ def solve(
             if moved:
                 task = task._replace(heights=np.ascontiguousarray(heights))
             reg = min(reg, 1e-3)
-    if status != ddp.NOT_FINITE:
-        ddp.close(body, task, s.kappas[-1], it, work)
-        worst = float(max(_violation(body, it).max(), 0.0))
+    ddp.close(body, task, s.kappas[-1], it, work)
+    worst = float(max(_violation(body, it).max(), 0.0))
     what = ddp.STATUS[status]
     if status == ddp.CONVERGED and worst > 10 * s.leg_tolerance:
         what = f"leg limits exceeded by {1e3 * worst:.2f} mm"
