@@ -69,7 +69,7 @@ def with_lead_in(
 
 
 def _balance(model: PointFootModel, body: Array, points: Array, stance: Array, acceleration: Array) -> Array:
-    """(C, 3) N: least forces on the body that carry it without turning it; feet in the air hang on it. None in flight."""
+    """(C, 3) N: least forces that carry the body without turning it; feet in the air hang on it. None in flight."""
     gravity = np.array([0.0, 0.0, model.g])
     u = -np.outer(np.where(stance, 0.0, model.foot_mass), gravity)
     if not stance.any():
