@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from slomo.reconstruct.segment import box_of, grown
+
 _BINS = 24
 
 
@@ -44,13 +46,25 @@ def to_lab(frame: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(frame, cv2.COLOR_RGB2LAB)
 
 
+def learn_colours(frames: np.ndarray, body: dict[int, np.ndarray]) -> ColourModel:
+    """Colours inside the silhouettes against those in a wide ring around them, over the clip."""
+    lab, inside, outside = [], [], []
+    for k, mask in body.items():
+        near = grown(mask, 0.5)
+        core = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        ring = near & ~grown(mask, 0.03)
+        take = (core | ring)[::2, ::2]
+        lab.append(to_lab(frames[k])[::2, ::2][take])
+        inside.append(core[::2, ::2][take])
+        outside.append(ring[::2, ::2][take])
+    return ColourModel.learn(*(np.concatenate(x) for x in (lab, inside, outside)))
+
+
 def cut(frame: np.ndarray, probability: np.ndarray, *, iterations: int = 2, margin: float = 0.15) -> np.ndarray:
     """Silhouette (H, W) bool by GrabCut (Rother, Kolmogorov and Blake, SIGGRAPH 2004) started from a probability.
 
     Pixels surer than 0.95 or less likely than 0.02 are held; the cut sees the neighbourhood of the others only.
     """
-    from slomo.reconstruct.segment import box_of
-
     start = probability > 0.5
     if start.sum() < 20:
         return start

@@ -13,11 +13,14 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from slomo.reconstruct.colour import ColourModel, cut, to_lab
+from slomo.reconstruct.background import Overlay
+from slomo.reconstruct.colour import ColourModel, cut, learn_colours, to_lab
 from slomo.reconstruct.flow import Flow
-from slomo.reconstruct.segment import Masks, Report, blend_over_time, component_at, no_subject
+from slomo.reconstruct.segment import Masks, Report, blend_over_time, component_at, grown, no_subject
+from slomo.reconstruct.tracks import background_tracks
 
 _SIDE = 256  # px, longer side at which motion is looked at
+_REACH = 40  # frames, how far frames may lie apart to be laid over each other
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class MotionSegmenter:
     every: int = 2
     gap: int = 4
     least_motion: float = 1.5
-    rounds: int = 2
+    rounds: int = 3
     name: str = "motion"
 
     def segment(self, frames: np.ndarray, flow: Flow, progress: Report) -> Masks:
@@ -56,17 +59,29 @@ class MotionSegmenter:
         layers = {k: np.clip(d / max(top[k], 0.5 * strength), 0, 1).astype(np.float32) for k, d in score.items()}
         moving = blend_over_time(layers, small, lambda f: progress(0.3 + 0.1 * f), neighbours=3)
 
+        tracks = background_tracks(frames, np.zeros(frames.shape[:3], bool))
+        overlay = Overlay.of(frames, tracks, size)
         prior = {k: cv2.resize(moving[k], (W, H), interpolation=cv2.INTER_LINEAR) for k in keys}
+        # At first whatever may be the subject is kept out of the background, later what is thought to be.
+        covered = {k: moving[k] > 0.3 for k in keys}
         body = {k: component_at(prior[k] > 0.5) for k in keys}
         for turn in range(self.rounds):
-            model = _colours(frames, body, prior)
-            for i, k in enumerate(keys):
-                body[k] = _refine(frames[k], prior[k], body[k], model)
-                progress(0.4 + 0.5 * (turn + (i + 1) / len(keys)) / self.rounds)
+            last = turn == self.rounds - 1
+            differs = {}
+            for k in keys:
+                others = [u for u in keys if 5 < abs(u - k) <= _REACH][:: max(1, 4 // self.every)]
+                differs[k] = cv2.resize(overlay.evidence(k, covered, others), (W, H), interpolation=cv2.INTER_LINEAR)
+            progress(0.4 + 0.5 * (turn + 0.4) / self.rounds)
+            model = learn_colours(frames, body) if turn else None
+            for k in keys:
+                body[k] = _refine(frames[k], prior[k], differs[k], body[k], model, last=last)
+                small_body = cv2.resize(body[k].astype(np.float32), size, interpolation=cv2.INTER_AREA)
+                covered[k] = cv2.dilate((small_body > 0.1).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+            progress(0.4 + 0.5 * (turn + 1) / self.rounds)
         probability = blend_over_time(
             {k: m.astype(np.float32) for k, m in body.items()}, flow, lambda f: progress(0.9 + 0.1 * f)
         )
-        masks = np.stack([component_at(p > 0.5) for p in probability])
+        masks = np.stack([component_at(p > 0.5, reach=round(0.06 * np.sqrt((p > 0.5).sum()))) for p in probability])
         if not masks.any():
             raise no_subject("what moves has no colours of its own")
         return Masks(masks, {"motion_px": strength, "motion_gap_frames": self.gap})
@@ -136,24 +151,16 @@ def border_distance(field: np.ndarray, *, step_cost: float = 0.002) -> np.ndarra
     return dijkstra(graph, directed=False, indices=root)[:root].reshape(h, w)
 
 
-def _colours(frames: np.ndarray, body: dict[int, np.ndarray], prior: dict[int, np.ndarray]) -> ColourModel:
-    """Colours inside the silhouettes against those in a wide ring around them, over the clip."""
-    lab, inside, outside = [], [], []
-    for k, mask in body.items():
-        reach = max(9, round(0.5 * np.sqrt(max(mask.sum(), 1))) | 1)
-        ring = (cv2.dilate(mask.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0) & ~mask
-        core = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        take = (core | ring)[::2, ::2]
-        lab.append(to_lab(frames[k])[::2, ::2][take])
-        inside.append(core[::2, ::2][take])
-        outside.append((ring & (prior[k] < 0.4))[::2, ::2][take])
-    return ColourModel.learn(*(np.concatenate(x) for x in (lab, inside, outside)))
-
-
-def _refine(frame: np.ndarray, prior: np.ndarray, body: np.ndarray, model: ColourModel) -> np.ndarray:
-    """Silhouette from motion (`prior` in [0, 1]) and colour, near to where it was thought to be."""
-    colour = np.clip(cv2.GaussianBlur(model(to_lab(frame)), (0, 0), 1.0), -4.0, 4.0)
-    logit = 10.0 * (prior - 0.42) + colour
+def _refine(frame, prior, differs, body, model: ColourModel | None, *, last: bool) -> np.ndarray:
+    """Silhouette from motion (`prior` in [0, 1]), difference from the background (log odds) and colour, near to where
+    it was thought to be; only the `last` one is cut out along edges."""
+    # Limbs that stand have the ground's motion: near the body, motion is asked for no more than this.
+    near = grown(body, 0.35)
+    logit = 10.0 * (np.where(near, np.maximum(prior, 0.25), prior) - 0.42) + 1.2 * differs
+    if model is not None:
+        logit += np.clip(cv2.GaussianBlur(model(to_lab(frame)), (0, 0), 1.0), -2.5, 2.5)
     probability = 1.0 / (1.0 + np.exp(-logit))
-    probability[prior < 0.12] = 0.0
-    return component_at(cut(frame, probability), body)
+    probability[~near & (prior < 0.12)] = 0.0
+    return component_at(
+        cut(frame, probability) if last else probability > 0.5, body, reach=round(0.06 * np.sqrt(body.sum()))
+    )

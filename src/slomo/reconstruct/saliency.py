@@ -2,11 +2,15 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
+from slomo.reconstruct.colour import cut, learn_colours, to_lab
 from slomo.reconstruct.flow import Flow, sample
-from slomo.reconstruct.segment import Masks, Report, blend_over_time, box_of, component_at, no_subject
+from slomo.reconstruct.segment import Masks, Report, blend_over_time, box_of, component_at, grown, no_subject
 from slomo.reconstruct.u2net import U2Net
+
+_FOREIGN = 0.1  # part of a mask with the surroundings' colours, above the usual, from which on it is cut anew
 
 
 @dataclass(frozen=True)
@@ -40,12 +44,15 @@ class SaliencySegmenter:
         layers: dict[int, np.ndarray] = {}
         for order in (keys[keys.index(seed) :], keys[: keys.index(seed) + 1][::-1]):
             self._track(order, whole[seed], frames, flow, layers)
-            progress(0.2 + 0.6 * len(layers) / len(keys))
+            progress(0.2 + 0.5 * len(layers) / len(keys))
+        repaired = _give_back_surroundings(frames, layers)
+        progress(0.8)
         probability = blend_over_time(layers, flow, lambda f: progress(0.8 + 0.15 * f))
         masks = np.stack([component_at(p > 0.5, p > 0.8) for p in probability])
         if not masks.any():
             raise no_subject("the network's answer does not hold over time")
-        return Masks(masks, {"weights_sha256": self.network.digest, "network_frames": len(layers), "seed_frame": seed})
+        report = {"weights_sha256": self.network.digest, "network_frames": len(keys), "seed_frame": seed}
+        return Masks(masks, report | {"colour_repaired_frames": repaired})
 
     def _track(self, order: list[int], first: np.ndarray, frames, flow: Flow, layers: dict[int, np.ndarray]) -> None:
         """Fill `layers` along `order`, whose first frame has the probability `first`."""
@@ -61,6 +68,39 @@ class SaliencySegmenter:
             layers[t] = seen
             if (found := seen > 0.5).any():
                 hint = found
+
+
+def _give_back_surroundings(frames: np.ndarray, layers: dict[int, np.ndarray]) -> int:
+    """Take out of `layers`, in place, what the network added of furniture and the like. Returns the frames concerned.
+
+    Colours are learned from the quarter of the masks that are smallest (though no slivers), against their
+    surroundings. A mask a good part of which has the colours of those surroundings is cut anew with them; what then is
+    left without most of the usual area says nothing and is dropped, for the frames next to it to fill.
+    """
+    bodies = {k: component_at(p > 0.5) for k, p in layers.items()}
+    area = {k: int(b.sum()) for k, b in bodies.items() if b.any()}
+    usual = np.median(list(area.values())) if area else 0.0
+    whole = sorted((k for k in area if area[k] > 0.3 * usual), key=lambda k: area[k])
+    trusted = whole[: max(2, len(whole) // 4)]
+    if len(trusted) < 2:
+        return 0
+    model = learn_colours(frames, {k: bodies[k] for k in trusted})
+    colour = {k: model(to_lab(frames[k])) for k in layers}
+    foreign = {k: float((colour[k][bodies[k]] < -1.0).mean()) for k in area}
+    usual_foreign = float(np.median([foreign[k] for k in trusted]))
+    swallowing = [k for k in area if foreign[k] > usual_foreign + _FOREIGN]
+    for k in swallowing:
+        smooth = np.clip(cv2.GaussianBlur(colour[k], (0, 0), 1.5), -4.0, 4.0)
+        logit = 4.0 * (layers[k] - 0.5) + smooth
+        probability = np.where(grown(bodies[k], 0.1), 1.0 / (1.0 + np.exp(-logit)), 0.0)
+        layers[k] = component_at(cut(frames[k], probability)).astype(np.float32)
+    if swallowing:
+        left = {k: float((p > 0.5).sum()) for k, p in layers.items()}
+        trusted_area = np.median([area[k] for k in trusted])
+        for k in swallowing:
+            if left[k] < 0.5 * trusted_area and len(layers) > len(left) // 3:
+                del layers[k]
+    return len(swallowing)
 
 
 def _clarity(probability: np.ndarray) -> float:

@@ -53,9 +53,12 @@ def box_of(mask: np.ndarray, *, margin: float = 0.0) -> tuple[int, int, int, int
     return max(0, xs[0] - grow), max(0, ys[0] - grow), min(w, xs[-1] + 1 + grow), min(h, ys[-1] + 1 + grow)
 
 
-def component_at(mask: np.ndarray, hint: np.ndarray | None = None) -> np.ndarray:
-    """The connected component of `mask` that shares most pixels with `hint`, with those no smaller than a
-    tenth of it that share some; without a hint, the largest. All False when `mask` is empty."""
+def component_at(mask: np.ndarray, hint: np.ndarray | None = None, *, reach: int = 0) -> np.ndarray:
+    """The connected component of `mask` that shares most pixels with `hint`; without a hint, the largest.
+
+    With `reach` (px) components that come as close to it as that, and have a hundredth of its area, belong to it: limbs
+    that something hides in part. All False when nothing is found.
+    """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     if count < 2:
         return np.zeros_like(mask, dtype=bool)
@@ -66,11 +69,20 @@ def component_at(mask: np.ndarray, hint: np.ndarray | None = None) -> np.ndarray
     best = int(score.argmax())
     if score[best] == 0:
         return np.zeros_like(mask, dtype=bool)
-    keep = np.arange(count) == best
-    if hint is not None:
-        keep |= (score > 0) & (stats[:, cv2.CC_STAT_AREA] > 0.1 * stats[best, cv2.CC_STAT_AREA])
-        keep[0] = False
-    return keep[labels]
+    out = labels == best
+    if reach:
+        ellipse = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+        close = np.bincount(labels[cv2.dilate(out.astype(np.uint8), ellipse) > 0], minlength=count) > 0
+        close &= stats[:, cv2.CC_STAT_AREA] > 0.01 * stats[best, cv2.CC_STAT_AREA]
+        close[0] = False
+        out = close[labels]
+    return out
+
+
+def grown(mask: np.ndarray, reach: float) -> np.ndarray:
+    """The mask grown by `reach` times the root of its area."""
+    side = 2 * round(reach * np.sqrt(max(mask.sum(), 1))) + 1
+    return cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
 
 
 def blend_over_time(layers: dict[int, np.ndarray], flow: Flow, progress: Report, *, neighbours: int = 2) -> np.ndarray:

@@ -10,6 +10,7 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -91,7 +92,8 @@ def reconstruct_structure(
         if not (root / "out.npz").exists():
             return None
         with np.load(root / "out.npz") as z:
-            return Structure(**{k: z[k] if z[k].ndim else float(z[k]) for k in z.files})
+            arrays: dict[str, Any] = {k: z[k] if z[k].ndim else float(z[k]) for k in z.files}
+        return Structure(**arrays)
 
 
 def _main(folder: str) -> None:
@@ -131,7 +133,7 @@ def _main(folder: str) -> None:
     models = pycolmap.incremental_mapping(database, images, root, mapping)
     if models:
         model = max(models.values(), key=lambda m: m.num_reg_images())
-        np.savez(root / "out.npz", **_arrays(model))
+        np.savez(root / "out.npz", allow_pickle=False, **_arrays(model))
 
 
 def _arrays(model) -> dict[str, np.ndarray]:

@@ -76,4 +76,4 @@ def _from_picture(path: Path) -> np.ndarray:
         raise InvalidData("not a readable picture", where=path, todo="give masks as PNG")
     if picture.ndim == 3 and picture.shape[2] == 4 and not picture[..., 3].all():
         return picture[..., 3] > 0  # drawn on transparency
-    return picture[..., :3].any(-1) if picture.ndim == 3 else picture > 0
+    return np.asarray(picture[..., :3].any(-1) if picture.ndim == 3 else picture > 0)

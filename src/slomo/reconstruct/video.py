@@ -75,7 +75,7 @@ def decode(
         stream = container.streams.video[0]
         info = _stream_info(container, stream)
         if start > 1.0:  # land on the key frame before the start
-            container.seek(int((float(pts[0]) + start - 0.5) / stream.time_base), stream=stream)
+            container.seek(int((float(pts[0]) + start - 0.5) / float(stream.time_base or 1)), stream=stream)
         aspect = float(stream.sample_aspect_ratio or 0) or 1.0
         stack, count, rotation = _fill(grid, _frames(stream, float(pts[0])), 1.0 / rate, aspect, max_side, progress)
     _require_enough(count, path, f"only {count} frames could be decoded")
@@ -129,7 +129,7 @@ def _timestamps(path: Path) -> tuple[np.ndarray, int]:
             for packet in container.demux(stream):
                 stamp = packet.pts if packet.pts is not None else packet.dts
                 if packet.size and stamp is not None and not packet.is_corrupt:
-                    stamps.append(float(stamp * stream.time_base))
+                    stamps.append(stamp * float(stream.time_base or 1))
         except av.error.FFmpegError:
             pass  # what follows the damage cannot be read; the frames before it can
         return np.unique(stamps), max(0, stream.frames - len(stamps))

@@ -1,0 +1,74 @@
+"""What stands out from the background seen at other times: frames laid over each other by the homography of most
+background tracks. Where the background is no such plane the laid-over frames disagree, and that says so."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from slomo.reconstruct.tracks import Tracks
+
+_NOISE = 9.0  # levels (of 255) in RGB that noise and sub-pixel shifts leave
+_SHADOW = (0.3, 0.95)  # a cast shadow multiplies the ground's colour by a factor in this range
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """Frames shrunk to `size` (width, height) in RGB, and the tracks that lay them over each other."""
+
+    rgb: np.ndarray  # (T, h, w, 3) float32
+    tracks: list[dict[int, np.ndarray]]
+    factor: float
+
+    @classmethod
+    def of(cls, frames: np.ndarray, tracks: Tracks, size: tuple[int, int]) -> "Overlay":
+        rgb = [cv2.GaussianBlur(cv2.resize(f, size, interpolation=cv2.INTER_AREA), (0, 0), 0.8) for f in frames]
+        table: list[dict[int, np.ndarray]] = [{} for _ in frames]
+        for t, i, xy in zip(tracks.frame.tolist(), tracks.track.tolist(), tracks.xy, strict=True):
+            table[t][i] = xy
+        return cls(np.array(rgb, np.float32), table, size[0] / frames.shape[2])
+
+    def homography(self, source: int, target: int) -> np.ndarray | None:
+        """(3, 3) from shrunk pixels of `source` to those of `target`, or None when too few tracks last."""
+        shared = sorted(self.tracks[source].keys() & self.tracks[target].keys())
+        if len(shared) < 30:
+            return None
+        a, b = (self.factor * np.array([self.tracks[t][i] for i in shared]) for t in (source, target))
+        cv2.setRNGSeed(0)
+        model, inliers = cv2.findHomography(a, b, cv2.RANSAC, 1.0)
+        return model if model is not None and inliers.mean() > 0.4 else None
+
+    def evidence(self, t: int, covered: dict[int, np.ndarray], others: list[int]) -> np.ndarray:
+        """(h, w) log odds, about -2 to 4, that a pixel of frame t is no background; 0 where that cannot be said.
+
+        Args:
+            covered: frame -> (h, w) bool, where the subject may be; such samples do not count.
+            others: frames to lay over t.
+        """
+        h, w = self.rgb.shape[1:3]
+        samples, valid = [], []
+        for u in others:
+            if (model := self.homography(t, u)) is None:
+                continue
+            flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+            samples.append(cv2.warpPerspective(self.rgb[u], model, (w, h), flags=flags))
+            free = (~covered[u]).astype(np.float32)
+            valid.append(cv2.warpPerspective(free, model, (w, h), flags=flags, borderValue=0.0) > 0.7)
+        if len(samples) < 2:
+            return np.zeros((h, w), np.float32)
+        x, ok = np.stack(samples), np.stack(valid)
+        count = ok.sum(0)
+        order = np.sort(np.where(ok[..., None], x, np.inf), axis=0)
+        middle = np.clip((count - 1) // 2, 0, None)[None, ..., None]
+        median = np.take_along_axis(order, middle, axis=0)[0]
+        median = np.where(np.isfinite(median), median, self.rgb[t])
+        spread = (np.abs(x - median).mean(-1) * ok).sum(0) / np.maximum(count, 1)
+        now = self.rgb[t]
+        size = np.linalg.norm(now - median, axis=-1)
+        shade = (now * median).sum(-1) / np.maximum((median**2).sum(-1), 1.0)
+        in_shade = np.linalg.norm(now - shade[..., None] * median, axis=-1)
+        size = np.where((shade > _SHADOW[0]) & (shade < _SHADOW[1]), in_shade, size)
+        ratio = size / (_NOISE + 1.5 * spread)
+        trust = np.clip(2.0 - spread / _NOISE, 0.0, 1.0)  # of "like the background": nothing where layers disagree
+        log_odds = np.where(ratio > 2.0, 1.5 * (ratio - 2.0), trust * (ratio - 2.0))
+        return np.where(count >= 2, np.clip(log_odds, -2.0, 4.0), 0.0).astype(np.float32)
