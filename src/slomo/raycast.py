@@ -132,9 +132,8 @@ class Scene:
             self._rest = wp.array(self._local, dtype=wp.vec3)
             self._ids = wp.array(np.concatenate(ids), dtype=int)
             self._grain = wp.array(np.concatenate(grain), dtype=wp.vec2)
-            self._normals = wp.array(self._world_normals, dtype=wp.vec3)
-            points = wp.array(self._world, dtype=wp.vec3)
-            self._mesh = wp.Mesh(points, wp.array(self._faces.ravel(), dtype=int))
+            self._indices = wp.array(self._faces.ravel(), dtype=int)
+        self._build()
         self._light = LightStruct()
         sun = np.asarray(light.sun, float)
         self._light.sun = wp.vec3(*(sun / np.linalg.norm(sun)))
@@ -143,21 +142,25 @@ class Scene:
         self._light.zenith, self._light.horizon = wp.vec3(*_linear(light.zenith)), wp.vec3(*_linear(light.horizon))
         self._light.hills, self._light.fog = light.hills, light.fog
 
+    def _build(self) -> None:
+        # A tree that is only refitted keeps the layout of the first pose; rays then take a hundred times longer.
+        with wp.ScopedDevice(self.device):
+            self._mesh = wp.Mesh(wp.array(self._world, dtype=wp.vec3), self._indices)
+            self._normals = wp.array(self._world_normals, dtype=wp.vec3)
+
     def move(self, poses: Mapping[str, np.ndarray]) -> None:
-        """Move parts. Args: poses: name -> T_world_part (4, 4), or deformed vertices (V, 3) in the world."""
+        """Move parts. Args: poses: name -> T_world_part (4, 4), which may stretch, or vertices (V, 3) in the world."""
         for name, pose in poses.items():
             s = self._slices[name]
             if pose.shape == (4, 4):
                 self._world[s] = self._local[s] @ pose[:3, :3].T + pose[:3, 3]
-                self._world_normals[s] = self._local_normals[s] @ pose[:3, :3].T
+                self._world_normals[s] = self._local_normals[s] @ np.linalg.inv(pose[:3, :3])
             else:
                 f = self._triangles[name]
                 self._world[s] = pose[f.ravel()] if name in self._flat else pose
                 local = np.arange(3 * len(f)).reshape(-1, 3) if name in self._flat else f
                 self._world_normals[s] = _normals(self._world[s], local)
-        self._mesh.points.assign(self._world)
-        self._normals.assign(self._world_normals)
-        self._mesh.refit()
+        self._build()
 
     def render(self, K: np.ndarray, T_world_cam: np.ndarray, size: Sequence[int], *, supersample: int = 1) -> Image:
         """Cast supersample^2 rays a pixel. Args: K (3, 3) px; T_world_cam (4, 4); size (width, height) px."""

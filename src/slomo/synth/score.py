@@ -7,22 +7,9 @@ import numpy as np
 
 from slomo.errors import InvalidData
 from slomo.motion import KeypointMotion
+from slomo.rotation import umeyama
 
 ROOTS = ("pelvis", "tail_base", "spine_mid")
-
-
-def similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Scale, rotation (3, 3) and translation (3,) that minimise sum |s R x + t - y|^2 over rows x, y of (N, 3).
-
-    Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
-    """
-    mean_x, mean_y = source.mean(0), target.mean(0)
-    x, y = source - mean_x, target - mean_y
-    U, S, Vt = np.linalg.svd(y.T @ x)
-    sign = np.array([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)])
-    R = (U * sign) @ Vt
-    s = float(S @ sign / max((x**2).sum(), 1e-30))
-    return s, R, mean_y - s * R @ mean_x
 
 
 def _at(t: np.ndarray, motion: KeypointMotion, names: list[str], tolerance: float) -> np.ndarray:
@@ -67,9 +54,9 @@ def score(motion: KeypointMotion, truth: Mapping[str, Any]) -> dict[str, Any]:
 
     aligned = []
     for f in frames:
-        s, R, shift = similarity(X[f, ok[f]], Y[f, ok[f]])
+        s, R, shift = umeyama(X[f, ok[f]], Y[f, ok[f]])
         aligned.append(np.linalg.norm(s * X[f, ok[f]] @ R.T + shift - Y[f, ok[f]], axis=-1))
-    s, R, shift = similarity(X[ok], Y[ok])
+    s, R, shift = umeyama(X[ok], Y[ok])
     error = np.where(ok, np.linalg.norm(s * X @ R.T + shift - Y, axis=-1), np.nan)
 
     percent = 100 / length

@@ -1,0 +1,1 @@
+"""What a person looks at: the side-by-side video, plots and tables."""
