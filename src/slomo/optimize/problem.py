@@ -29,7 +29,7 @@ class Weights:
     position: float = 1000.0
     orientation: float = 200.0
     foot: float = 500.0
-    foot_height: float = 1000.0
+    foot_height: float = 3000.0
     velocity: float = 1.0
     angular_velocity: float = 0.5
     foot_velocity: float = 0.3
