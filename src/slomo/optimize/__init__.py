@@ -1,0 +1,1 @@
+"""Contact-implicit trajectory optimisation of the point-foot model."""

@@ -7,8 +7,7 @@
     slip                             w |s(gamma) v_next_xy|^2 of each point, s = gamma / (gamma + slip_load)
     leg length                       augmented Lagrangian of leg_min <= |p + R hip - f| <= leg_max
 
-Stage costs are multiplied by the step length h, so that weights mean the same at any dt. One half is left out nowhere:
-the cost is (1/2) sum h w r^2.
+The cost is (1/2) sum h w r^2 over the steps of length h, so that weights mean the same at any dt.
 """
 
 from math import sqrt

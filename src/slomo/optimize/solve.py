@@ -22,7 +22,7 @@ class Settings:
 
     Attributes:
         kappas: N m, falling: the homotopy of the contact.
-        iterations, early_iterations: most Newton steps at the last kappa, and at each one before, which only leads to it.
+        iterations, early_iterations: most Newton steps at the last kappa, and at each one that leads to it.
         tolerance: of the relative decrease still expected.
         leg_penalty: 1/m^2, first penalty of the leg limits.  leg_tolerance: m, largest violation accepted.
         rounds: of the augmented Lagrangian (and of moving the ground) at the last kappa.

@@ -61,7 +61,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     want = problem.targets(motion, model, terrain, dt=config.dt)
     task = problem.make_task(model, want, terrain, config)
     start = problem.make_start(model, want, task.heights)
-    progress.update(0.02, "loading the compiled solver")
+    progress.update(0.02, "loading the compiled solver (the first run compiles it, which takes half a minute)")
     settings = Settings(
         kappas=(*(k for k in Settings().kappas if k > config.kappa), config.kappa),
         iterations=config.iterations,
