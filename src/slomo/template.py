@@ -47,7 +47,7 @@ def _entries(module: str, name: str) -> list[tuple[str, Any, str]]:
 
 
 def _described(docstring: str, fields: Mapping[str, Any]) -> dict[str, str]:
-    """Field -> text of its `field: text`, `field, field: text` or `fie*: text` in the docstring's list of attributes."""
+    """Field -> text of `field: text`, `field, field: text` or `fie*: text` in the docstring's list of attributes."""
     text = " ".join(docstring.partition("Attributes:\n")[2].split("\n\n")[0].split())
     name = "(?:" + "|".join([*fields, r"\w+\*"]) + ")"
     parts = re.split(rf"(?:^|(?<=[.;] ))({name}(?:, {name})*): ", text)

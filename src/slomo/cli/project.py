@@ -27,8 +27,8 @@ def _all_states(session: Session, robot: str | None) -> "dict[str, State]":
     for name in sorted(robots):
         own = Project(session.root, name)
         try:
-            own.robot  # noqa: B018 (loads it)
-        except SlomoError as e:
+            own.label(own.chain("report")[-1])
+        except SlomoError as e:  # a robot that is gone, or a choice to be made between clip and key points
             if robot:
                 raise
             session.console.note(str(e))

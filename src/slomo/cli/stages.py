@@ -8,6 +8,20 @@ import typer
 from slomo.cli.session import RobotOption, Session, command
 from slomo.errors import UsageError
 
+SkeletonOption = Annotated[
+    str | None, typer.Option("--skeleton", metavar="quadruped|human|PATH", help="Whose bones to fit.")
+]
+SegmenterOption = Annotated[
+    str | None, typer.Option("--segmenter", metavar="auto|u2netp|motion|user", help="How the subject is found.")
+]
+MasksOption = Annotated[Path | None, typer.Option("--masks", metavar="DIR", help="Your own masks, one image a frame.")]
+WeightsOption = Annotated[Path | None, typer.Option("--weights", help="U2-Net-p weights (.onnx).")]
+StartOption = Annotated[float | None, typer.Option("--start", help="First second of the clip to use.")]
+DurationOption = Annotated[float | None, typer.Option("--duration", help="Seconds to use; 0: all.")]
+LengthOption = Annotated[
+    float | None, typer.Option("--length", help="Body length in metres (the clip alone cannot tell it).")
+]
+FovOption = Annotated[float | None, typer.Option("--fov", help="Horizontal field of view in degrees.")]
 TruthOption = Annotated[
     Path | None, typer.Option("--truth", help="truth.npz of a rendered clip: the report scores the reconstruction.")
 ]
@@ -32,6 +46,31 @@ def _skeleton(session: Session, skeleton: str | None) -> dict[str, dict[str, Any
     return {"inputs": {"skeleton": session.user_path(Path(skeleton), "skeleton")}}
 
 
+def _from_clip(
+    session: Session,
+    skeleton: str | None,
+    segmenter: str | None,
+    masks: Path | None,
+    weights: Path | None,
+    start: float | None,
+    duration: float | None,
+    length: float | None,
+    fov: float | None,
+) -> dict[str, dict[str, Any]]:
+    """The options of `reconstruct` as entries of slomo.toml."""
+    changes = _skeleton(session, skeleton)
+    files = {"masks": masks, "weights": weights}
+    inputs = {role: session.user_path(path, role) for role, path in files.items() if path is not None}
+    changes["inputs"] = changes.get("inputs", {}) | inputs
+    changes["decode"] = _given(start=start, duration=duration)
+    changes["masks"] = _given(segmenter=segmenter)
+    if masks is not None and segmenter is None:
+        changes["masks"] = {"segmenter": None}  # the default takes the masks that are given
+    changes["camera"] = _given(fov_deg=fov)
+    changes["reconstruct"] = changes.get("reconstruct", {}) | _given(length_m=length)
+    return changes
+
+
 def _truth(session: Session, truth: Path | None) -> dict[str, Any]:
     return {} if truth is None else {"truth": session.user_path(truth, "truth")}
 
@@ -43,22 +82,14 @@ def add_commands(app: typer.Typer) -> None:
     def reconstruct(
         session: Session,
         clip: Annotated[Path | None, typer.Argument(help="Video file. Default: the one of the last call.")] = None,
-        skeleton: Annotated[
-            str | None, typer.Option("--skeleton", metavar="quadruped|human|PATH", help="Whose bones to fit.")
-        ] = None,
-        segmenter: Annotated[
-            str | None, typer.Option("--segmenter", metavar="auto|u2netp|motion|user", help="How the subject is found.")
-        ] = None,
-        masks: Annotated[
-            Path | None, typer.Option("--masks", metavar="DIR", help="Your own masks, one image a frame.")
-        ] = None,
-        weights: Annotated[Path | None, typer.Option("--weights", help="U2-Net-p weights (.onnx).")] = None,
-        start: Annotated[float | None, typer.Option("--start", help="First second of the clip to use.")] = None,
-        duration: Annotated[float | None, typer.Option("--duration", help="Seconds to use; 0: all.")] = None,
-        length: Annotated[
-            float | None, typer.Option("--length", help="Body length in metres (the clip alone cannot tell it).")
-        ] = None,
-        fov: Annotated[float | None, typer.Option("--fov", help="Horizontal field of view in degrees.")] = None,
+        skeleton: SkeletonOption = None,
+        segmenter: SegmenterOption = None,
+        masks: MasksOption = None,
+        weights: WeightsOption = None,
+        start: StartOption = None,
+        duration: DurationOption = None,
+        length: LengthOption = None,
+        fov: FovOption = None,
     ) -> None:
         """Key points in metres from a clip: decode, masks, camera, skeleton fit.
 
@@ -69,18 +100,9 @@ def add_commands(app: typer.Typer) -> None:
         slomo reconstruct cat.mp4 --duration 4 --length 0.45
         slomo reconstruct man.mp4 --skeleton human
         """
-        files = {"clip": clip, "masks": masks, "weights": weights}
-        inputs = {role: session.user_path(path, role) for role, path in files.items() if path is not None}
-        changes = _skeleton(session, skeleton)
-        changes["inputs"] = changes.get("inputs", {}) | inputs
+        changes = _from_clip(session, skeleton, segmenter, masks, weights, start, duration, length, fov)
         if clip is not None:
-            changes["inputs"] |= session.choice_reopened("clip")
-        changes["decode"] = _given(start=start, duration=duration)
-        changes["masks"] = _given(segmenter=segmenter)
-        if masks is not None and segmenter is None:
-            changes["masks"] = {"segmenter": None}  # the default takes the masks that are given
-        changes["camera"] = _given(fov_deg=fov)
-        changes["reconstruct"] = changes.get("reconstruct", {}) | _given(length_m=length)
+            changes["inputs"] |= {"clip": session.user_path(clip, "clip")} | session.choice_reopened("clip")
         project = session.configure(changes)
         session.emit_artifact(session.runner(project).make("reconstruct"))
 
@@ -170,19 +192,29 @@ def add_commands(app: typer.Typer) -> None:
         ] = None,
         no_video: Annotated[bool, typer.Option("--no-video", help="Leave out the report with its video.")] = False,
         truth: TruthOption = None,
+        skeleton: SkeletonOption = None,
+        segmenter: SegmenterOption = None,
+        masks: MasksOption = None,
+        weights: WeightsOption = None,
+        start: StartOption = None,
+        duration: DurationOption = None,
+        length: LengthOption = None,
+        fov: FovOption = None,
     ) -> None:
         """Everything, from the clip (or key points) to the robot and the report. What is current is kept.
 
         \b
         slomo run cat.mp4 --robot go1
+        slomo run cat.mp4 --robot go1 --duration 4 --length 0.45
         slomo run cat00.json --robot go1
         """
-        changes: dict[str, Any] = _truth(session, truth)
+        changes = _from_clip(session, skeleton, segmenter, masks, weights, start, duration, length, fov)
+        inputs = changes["inputs"]
+        inputs |= _truth(session, truth)
         if source is not None:
             role = "keypoints" if source.suffix in KEYPOINT_SUFFIXES else "clip"
-            changes[role] = session.user_path(source, role)
-            changes["motion"] = "import" if role == "keypoints" else "reconstruct"
-            if not session.given("clip" if role == "keypoints" else "keypoints"):
-                changes["motion"] = None
-        project = session.configure({"inputs": changes}, robot)
+            inputs[role] = session.user_path(source, role)
+            both = session.given("clip" if role == "keypoints" else "keypoints")
+            inputs["motion"] = None if not both else "import" if role == "keypoints" else "reconstruct"
+        project = session.configure(changes, robot)
         session.emit_artifact(session.runner(project).make("track" if no_video else "report"))
