@@ -119,8 +119,8 @@ def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
 
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
-    """One torch thread: sums then round alike on every machine, and these small tensors gain nothing from two (on a busy
-    machine threads that wait for each other make it ten times slower)."""
+    """One torch thread: sums then round alike on every machine, and tensors of this size gain little from two (on a
+    busy machine threads that wait for each other make it many times slower)."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
