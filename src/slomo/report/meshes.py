@@ -13,7 +13,7 @@ from slomo.robot import Robot
 from slomo.terrain import Terrain
 
 GREY = (0.62, 0.63, 0.65)
-CELL = 0.004  # m, what a picture of half a metre in 300 px can show
+CELL = 0.0025  # m, what a picture of half a metre in 300 px can show
 
 
 def robot_parts(robot: Robot) -> tuple[dict[str, Part], dict[str, str]]:
@@ -45,8 +45,10 @@ def robot_parts(robot: Robot) -> tuple[dict[str, Part], dict[str, str]]:
                 own = getattr(getattr(mesh.visual, "material", None), "main_color", None)
                 rgb = color if color is not None else np.array(own[:3]) / 255 if own is not None else np.array(GREY)
                 name = f"{link.get('name')}/{i}/{k}"
-                # Neither pure black nor pure white: light must show the shape.
-                parts[name] = Part(vertices @ T[:3, :3].T + T[:3, 3], triangles, np.clip(rgb, 0.10, 0.86))
+                # Neither pure black nor pure white: light must show the shape. Flat: meshes meant for display
+                # have faces of either orientation, whose normals must not be averaged.
+                vertices = vertices @ T[:3, :3].T + T[:3, 3]
+                parts[name] = Part(vertices, triangles, np.clip(rgb, 0.10, 0.86), smooth=False)
                 links[name] = str(link.get("name"))
     if not parts:
         raise InvalidData("has no visual geometry", where=robot.urdf)
@@ -126,7 +128,7 @@ def unit_arrow() -> trimesh.Trimesh:
     shaft.apply_translation([0, 0, 0.375])
     head = trimesh.creation.cone(radius=2.6, height=0.25, sections=18)
     head.apply_translation([0, 0, 0.75])
-    return trimesh.util.concatenate([shaft, head])
+    return shaft + head
 
 
 def between(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Protocol
 
 import cv2
@@ -25,10 +26,12 @@ BLUE, VERMILION, GREY = (0.0, 0.45, 0.70), (0.84, 0.37, 0.0), (0.55, 0.56, 0.58)
 
 _CHAINS = (
     ("nose", "head", "neck", "withers", "spine_mid", "pelvis", "tail_base", "tail_tip"),
-    ("withers", "chest"),
     *(
-        (root, f"{end}_{side}_{a}", f"{end}_{side}_{b}", f"{end}_{side}_{c}", f"{end}_{side}_paw")
-        for end, root, a, b, c in (("front", "chest", "shoulder", "elbow", "wrist"), ("hind", "pelvis", "hip", "knee", "hock"))
+        (*root, *(f"{end}_{side}_{joint}" for joint in leg))
+        for end, root, leg in (
+            ("front", ("withers", "chest"), ("shoulder", "elbow", "wrist", "paw")),
+            ("hind", ("pelvis",), ("hip", "knee", "hock", "paw")),
+        )
         for side in ("left", "right")
     ),
     ("head_top", "head", "neck", "chest", "spine_mid", "pelvis"),
@@ -49,7 +52,7 @@ def bones(names: tuple[str, ...]) -> list[tuple[int, int]]:
     out: dict[tuple[int, int], None] = {}
     for chain in _CHAINS:
         present = [names.index(n) for n in chain if n in names]
-        out |= dict.fromkeys(zip(present, present[1:], strict=False))
+        out |= dict.fromkeys(pairwise(present))
     return list(out)
 
 
@@ -92,7 +95,7 @@ class View:
     def camera(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         """K and T_world_cam at time t."""
         hfov = np.radians(38)
-        distance = self.extent / (2 * np.tan(hfov / 2) * 0.66)
+        distance = self.extent / (2 * np.tan(hfov / 2) * 0.80)
         target = np.array([np.interp(t, self.t, self.path[:, k]) for k in range(3)])
         up = np.radians(17)
         away = [np.cos(up) * np.cos(self.azimuth), np.cos(up) * np.sin(self.azimuth), np.sin(up)]
@@ -206,7 +209,7 @@ class ReferencePanel:
     ):
         self.reference, self.hips = reference, hips
         extent = robot_extent(robot)
-        self._arrow = 0.55 * extent / weight  # m/N: the whole weight on one foot is an arrow of half the picture
+        self._arrow = 0.9 * extent / weight  # m/N: the whole weight on one foot is nearly the robot's length
         self._thick = 0.008 * extent
         self._rotations = Rotation.from_quat(reference.q[:, 3:7]).as_matrix()
         half = np.maximum(np.abs(hips).max(0), 0.04 * extent) * [1.1, 0.9, 1.0]
@@ -238,14 +241,14 @@ class ReferencePanel:
         poses = {"body": T}
         for c, (hip, foot) in enumerate(zip(hips, feet, strict=True)):
             poses |= {
-                f"leg{c}": meshes.between(hip, foot, self._thick),
+                f"leg{c}": meshes.between(hip, foot, 0.6 * self._thick),
                 f"hip{c}": meshes.at(hip, 2 * self._thick),
                 f"foot{c}": meshes.at(foot, 2 * self._thick),
             }
             force = self._arrow * r.lam[k, c]
             visible = np.linalg.norm(force) > 4 * self._thick
             tip = foot + force
-            poses[f"force{c}"] = meshes.between(foot, tip, 0.9 * self._thick) if visible else meshes.at(hip, 1e-4)
+            poses[f"force{c}"] = meshes.between(foot, tip, 1.2 * self._thick) if visible else meshes.at(hip, 1e-4)
         self._scene.move(poses)
         return self._scene.picture(*self._view.camera(t), SIZE)
 

@@ -34,9 +34,8 @@ def rows(
         _row("retarget", "distance", retarget.get("distance_m"), "m"),
     ]
     limits = optimize.get("limits", {})
-    units = {
-        "dynamics_residual": "", "complementarity": "N m", "penetration": "m", "slip_per_second": "m/s", "torque_ratio": "",
-    }  # fmt: skip
+    units = {"dynamics_residual": "", "complementarity": "N m", "penetration": "m", "slip_per_second": "m/s"}
+    units["torque_ratio"] = ""
     for key, unit in units.items():
         out.append(_row("optimize", key.replace("_", " "), optimize.get(key), unit, limits.get(key)))
     out += [

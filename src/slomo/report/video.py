@@ -48,7 +48,7 @@ def _bars(
     """One bar for each time that `on` is true."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(int), [0]])))
     for a, b in edges.reshape(-1, 2):
-        draw.rectangle([x(t[a]), y, x(t[min(b, len(t) - 1)]), y + ROW // 2 - 1], fill=color)
+        draw.rectangle([x(float(t[a])), y, x(float(t[min(b, len(t) - 1)])), y + ROW // 2 - 1], fill=color)
 
 
 def _strip(width: int, duration: float, falls: FootFalls) -> Image.Image:
