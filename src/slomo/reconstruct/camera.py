@@ -55,7 +55,7 @@ def estimate_camera(
         return _turning(frames, masks, R, settings.focal, center, report)
 
     fit = _fit_turning(tracks, keys, gaps, center, settings)
-    wide = _wide_residual(tracks, keys, gaps, fit, center)
+    wide = _wide_residual(tracks, keys, gaps, fit)
     limit = _PARALLAX_PX * max(h, w) / 640
     report = {"background_motion_px": motion, "turning_residual_px": wide}
     progress.update(0.2, f"residual of a turning camera {wide:.2f} px")
@@ -92,7 +92,7 @@ def estimate_camera(
         "mode": "panning",
         "reprojection_error_px": float(np.median(fit.residual)),
         "focal_observed": bool(observed and settings.refine_focal),
-        "focal_std_px": fit.focal_std if np.isfinite(fit.focal_std) else None,
+        "focal_std_px": float(fit.focal_std) if np.isfinite(fit.focal_std) else None,
     }
     return _turning(frames, masks, R, fit.focal, center, report)
 
@@ -120,12 +120,12 @@ def _fit_turning(
     return fit
 
 
-def _wide_residual(tracks: Tracks, keys: np.ndarray, gaps, fit: rotation_ba.RotationFit, center: np.ndarray) -> float:
-    """px, upper-quartile residual of pairs that lie a second or more apart (the widest gap there is, if none do)."""
+def _wide_residual(tracks: Tracks, keys: np.ndarray, gaps, fit: rotation_ba.RotationFit) -> float:
+    """px, median residual of pairs that lie a second or more apart (the widest gap there is, if none do)."""
     which, _, _ = tracks.pairs(gaps, keys)
     gap = which[:, 1] - which[:, 0]
     wide = gap >= min(gaps[-2] if len(gaps) > 1 else gaps[0], gap.max(initial=1))
-    return float(np.quantile(fit.residual[wide], 0.75)) if wide.any() else 0.0
+    return float(np.median(fit.residual[wide])) if wide.any() else 0.0
 
 
 def _all_rotations(
@@ -184,7 +184,7 @@ def _turning(frames, masks, R: np.ndarray, focal: float, center: np.ndarray, rep
     T = np.tile(np.eye(4), (len(frames), 1, 1))
     T[:, :3, :3] = _world_from(g.up, R[0][:, 2]) @ R
     T[:, 2, 3] = 1.0
-    report |= {"focal_px": focal, "scale_source": "camera height set to 1"} | _gravity_report(g)
+    report |= {"focal_px": float(focal), "scale_source": "camera height set to 1"} | _gravity_report(g)
     return CameraPath(_intrinsics(focal, center), T, report)
 
 

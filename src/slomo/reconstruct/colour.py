@@ -46,11 +46,11 @@ def to_lab(frame: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(frame, cv2.COLOR_RGB2LAB)
 
 
-def learn_colours(frames: np.ndarray, body: dict[int, np.ndarray]) -> ColourModel:
-    """Colours inside the silhouettes against those in a wide ring around them, over the clip."""
+def learn_colours(frames: np.ndarray, body: dict[int, np.ndarray], *, reach: float = 0.5) -> ColourModel:
+    """Colours inside the silhouettes against those around them up to `reach` roots of their area, over the clip."""
     lab, inside, outside = [], [], []
     for k, mask in body.items():
-        near = grown(mask, 0.5)
+        near = grown(mask, reach)
         core = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         ring = near & ~grown(mask, 0.03)
         take = (core | ring)[::2, ::2]

@@ -78,10 +78,10 @@ class MotionSegmenter:
                 small_body = cv2.resize(body[k].astype(np.float32), size, interpolation=cv2.INTER_AREA)
                 covered[k] = cv2.dilate((small_body > 0.1).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
             progress(0.4 + 0.5 * (turn + 1) / self.rounds)
-        probability = blend_over_time(
-            {k: m.astype(np.float32) for k, m in body.items()}, flow, lambda f: progress(0.9 + 0.1 * f)
-        )
-        masks = np.stack([component_at(p > 0.5, reach=round(0.06 * np.sqrt((p > 0.5).sum()))) for p in probability])
+        # One neighbour on either side: flow carries the body far, but not legs.
+        layers = {k: m.astype(np.float32) for k, m in body.items()}
+        probability = blend_over_time(layers, flow, lambda f: progress(0.9 + 0.1 * f), neighbours=1)
+        masks = np.stack([component_at(p > 0.45, reach=round(0.06 * np.sqrt((p > 0.5).sum()))) for p in probability])
         if not masks.any():
             raise no_subject("what moves has no colours of its own")
         return Masks(masks, {"motion_px": strength, "motion_gap_frames": self.gap})

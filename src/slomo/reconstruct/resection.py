@@ -50,7 +50,7 @@ def _resect(points: np.ndarray, xy: np.ndarray, K: np.ndarray, guess: np.ndarray
     )
     if not ok or inliers is None or len(inliers) < _MIN_POINTS:
         return None
-    keep = inliers[:, 0]
+    keep = np.asarray(inliers)[:, 0].astype(int)
     turn, shift = cv2.solvePnPRefineLM(points[keep], xy[keep].astype(float), K, None, turn, shift)
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_rotvec(np.ravel(turn)).as_matrix()

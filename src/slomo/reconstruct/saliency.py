@@ -84,7 +84,7 @@ def _give_back_surroundings(frames: np.ndarray, layers: dict[int, np.ndarray]) -
     trusted = whole[: max(2, len(whole) // 4)]
     if len(trusted) < 2:
         return 0
-    model = learn_colours(frames, {k: bodies[k] for k in trusted})
+    model = learn_colours(frames, {k: bodies[k] for k in trusted}, reach=2.0)
     colour = {k: model(to_lab(frames[k])) for k in layers}
     foreign = {k: float((colour[k][bodies[k]] < -1.0).mean()) for k in area}
     usual_foreign = float(np.median([foreign[k] for k in trusted]))

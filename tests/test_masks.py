@@ -1,0 +1,193 @@
+"""Masks: the user's own, the motion segmenter on clips with known answers, flow, and the errors."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from slomo.errors import InvalidData, UsageError
+from slomo.reconstruct.flow import dense_flow
+from slomo.reconstruct.motion_segment import border_distance
+from slomo.reconstruct.segment import blend_over_time, component_at, frame_quality
+from slomo.reconstruct.stage import DecodeConfig, MasksConfig, pack, run_decode, run_masks, unpack
+from slomo.stage import Artifact, Inputs, Silent
+
+SHARED = Path(__file__).parents[2] / "shared"
+ASSET = Path(__file__).parents[1] / "src/slomo/assets/walk"
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return (a & b).sum((1, 2)) / np.maximum((a | b).sum((1, 2)), 1)
+
+
+def noise(h: int, w: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    layers = [
+        cv2.resize(rng.uniform(0, 255, (h // s + 1, w // s + 1, 3)).astype(np.float32), (w, h)) for s in (3, 10, 30)
+    ]
+    return sum(layers) / 3  # type: ignore[return-value]
+
+
+def moving_disc(T: int = 24, *, speed: float = 2.0, camera: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """A textured ellipse that crosses a textured background while the camera drifts. Frames and masks."""
+    ground, coat = noise(160, 320, 0), 0.6 * noise(160, 320, 1) + np.array([80, 20, 0])
+    y, x = np.mgrid[:120, :200]
+    frames, masks = [], []
+    for t in range(T):
+        shift = round(camera * t)
+        center = 60 + speed * t
+        mask = ((x - center) / 28) ** 2 + ((y - 60) / 20) ** 2 < 1
+        picture = ground[20:140, 30 + shift : 230 + shift].copy()
+        coat_now = np.roll(coat, round(center), axis=1)[20:140, :200]
+        picture[mask] = coat_now[mask]
+        frames.append(np.uint8(np.clip(picture, 0, 255)))
+        masks.append(mask)
+    return np.array(frames), np.array(masks)
+
+
+def inputs(frames: np.ndarray, **files) -> Inputs:
+    decoded = Artifact(npz={"frames.npz": {"frames": frames, "t": np.arange(len(frames)) / 30}})
+    return Inputs(artifacts={"decode": decoded}, files=files)
+
+
+def test_flow_of_a_shift():
+    image = np.uint8(noise(100, 160, 2))
+    flow = dense_flow(np.array([image[10:90, 20:140], image[12:92, 17:137]]))
+    middle = flow.forward[0, 20:60, 20:100].astype(float)
+    np.testing.assert_allclose(np.median(middle, axis=(0, 1)), [3, -2], atol=0.1)
+    np.testing.assert_allclose(np.median(flow.backward[0, 20:60, 20:100].astype(float), axis=(0, 1)), [-3, 2], atol=0.1)
+    assert flow.consistent[0, 20:60, 20:100].mean() > 0.95
+
+
+def test_chained_flow_and_the_frames_between():
+    frames, masks = moving_disc(8)
+    flow = dense_flow(frames)
+    inner = cv2.erode(masks[6].astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
+    np.testing.assert_allclose(np.median(flow.chain(6, 0)[inner], axis=0), [-12, 0], atol=0.04 * 12)
+    np.testing.assert_allclose(np.median(flow.chain(0, 6)[np.roll(inner, -12, 1)], axis=0), [12, 0], atol=0.04 * 12)
+    layers = {t: masks[t].astype(np.float32) for t in (0, 2, 4, 6, 7)}
+    filled = blend_over_time(layers, flow, lambda f: None, neighbours=1)
+    assert iou(filled > 0.5, masks).min() > 0.9
+
+
+def test_component_and_reach():
+    mask = np.zeros((40, 60), bool)
+    mask[5:15, 5:25] = mask[17:30, 8:12] = mask[5:35, 40:58] = True
+    assert component_at(mask)[10, 50]
+    hint = np.zeros_like(mask)
+    hint[8:12, 8:12] = True
+    assert component_at(mask, hint).sum() == 200
+    assert component_at(mask, hint, reach=4).sum() == 252
+    assert not component_at(np.zeros_like(mask)).any()
+
+
+def test_border_distance_sees_bodies_and_not_posts():
+    """A post shares the ground's motion at its foot; a body is closed off all around."""
+    field = np.zeros((60, 90, 2))
+    field[10:50, 20:25, 0] = np.linspace(8, 0, 40)[:, None]  # parallax grows towards the top
+    field[20:40, 50:70, 0] = 5.0
+    score = border_distance(field)
+    assert score[30, 60] > 4.5
+    assert score[48, 22] < 1.0
+    assert score[5, 5] < 0.1
+
+
+def test_quality_falls_where_the_mask_jumps():
+    frames, masks = moving_disc(10)
+    flow = dense_flow(frames)
+    good = frame_quality(masks, flow)
+    assert good.min() > 0.85
+    broken = masks.copy()
+    broken[5] = np.roll(masks[5], 30, axis=1)
+    assert frame_quality(broken, flow)[5] < 0.6 * good[5]
+    assert frame_quality(np.zeros_like(masks), flow).max() == 0
+
+
+@pytest.mark.parametrize("camera", [0.0, 1.0])
+def test_motion_segmenter(camera):
+    frames, truth = moving_disc(camera=camera)
+    notes = []
+    progress = Silent()
+    progress.note = notes.append  # type: ignore[method-assign]
+    out = run_masks(inputs(frames), MasksConfig(), progress)
+    masks = unpack(out.npz["masks.npz"])
+    assert iou(masks, truth).mean() > 0.85
+    assert out.json["report.json"]["segmenter"] == "motion"
+    assert any("motion" in note for note in notes)
+    assert out.npz["masks.npz"]["quality"].shape == (24,)
+    assert out.npz["flow.npz"]["flow"].dtype == np.float16
+
+
+def test_clip_without_a_subject():
+    frames = np.repeat(np.uint8(noise(120, 200, 3))[None], 10, 0)
+    with pytest.raises(InvalidData, match="no subject found") as caught:
+        run_masks(inputs(frames), MasksConfig(segmenter="motion"), Silent())
+    assert "--masks" in str(caught.value)
+
+
+def test_user_masks(tmp_path):
+    frames, truth = moving_disc(10)
+    for t, mask in enumerate(truth):
+        cv2.imwrite(str(tmp_path / f"{t:03d}.png"), cv2.resize(255 * mask.astype(np.uint8), (400, 240)))
+    out = run_masks(inputs(frames, masks=tmp_path), MasksConfig(), Silent())
+    assert iou(unpack(out.npz["masks.npz"]), truth).min() > 0.95
+    assert out.json["report.json"]["segmenter"] == "user"
+    np.savez(tmp_path / "masks.npz", allow_pickle=False, **pack(truth))
+    out = run_masks(inputs(frames, masks=tmp_path / "masks.npz"), MasksConfig(), Silent())
+    np.testing.assert_array_equal(unpack(out.npz["masks.npz"]), truth)
+
+
+def test_user_masks_that_do_not_fit(tmp_path):
+    frames, truth = moving_disc(10)
+    for t in range(7):
+        cv2.imwrite(str(tmp_path / f"{t}.png"), 255 * truth[t].astype(np.uint8))
+    with pytest.raises(InvalidData, match="holds 7 masks, the decoded clip has 10"):
+        run_masks(inputs(frames, masks=tmp_path), MasksConfig(), Silent())
+    (tmp_path / "a.npz").write_text("not an archive")
+    with pytest.raises(InvalidData, match="cannot be read as masks"):
+        run_masks(inputs(frames, masks=tmp_path / "a.npz"), MasksConfig(), Silent())
+
+
+def test_choice_of_segmenter(tmp_path):
+    frames, _ = moving_disc(10)
+    with pytest.raises(UsageError, match=r"auto, u2netp, motion, user"):
+        run_masks(inputs(frames), MasksConfig(segmenter="sam"), Silent())
+    with pytest.raises(UsageError, match="SLOMO_U2NETP"):
+        run_masks(inputs(frames), MasksConfig(segmenter="u2netp"), Silent())
+    with pytest.raises(UsageError, match="--masks"):
+        run_masks(inputs(frames), MasksConfig(segmenter="user"), Silent())
+    (tmp_path / "w.onnx").write_text("no network")
+    with pytest.raises(InvalidData, match="not a network"):
+        run_masks(inputs(frames, weights=tmp_path / "w.onnx"), MasksConfig(), Silent())
+
+
+def shared(*parts: str) -> Path:
+    path = SHARED.joinpath(*parts)
+    if not path.exists():
+        pytest.skip(f"needs ../shared/{'/'.join(parts)}")
+    return path
+
+
+@pytest.mark.slow
+def test_network_on_the_camel():
+    """The bar of the first light: mean IoU of 0.80 with the camel's truth."""
+    clip, weights = shared("clips", "camel"), shared("weights", "u2netp.onnx")
+    decoded = run_decode(Inputs(files={"clip": clip / "clip.mp4"}), DecodeConfig(), Silent())
+    out = run_masks(Inputs(artifacts={"decode": decoded}, files={"weights": weights}), MasksConfig(), Silent())
+    masks = unpack(out.npz["masks.npz"])
+    with np.load(clip / "masks.npz") as z:
+        size = masks.shape[:0:-1]
+        truth = [cv2.resize(m.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5 for m in unpack(z)]
+    assert iou(masks, np.array(truth)).mean() >= 0.80
+    assert out.json["report.json"]["segmenter"] == "u2netp"
+
+
+@pytest.mark.slow
+def test_motion_on_the_embedded_clip():
+    """`make demo` has no network: motion alone has to do."""
+    decoded = run_decode(Inputs(files={"clip": ASSET / "clip.mp4"}), DecodeConfig(), Silent())
+    out = run_masks(Inputs(artifacts={"decode": decoded}), MasksConfig(segmenter="motion"), Silent())
+    with np.load(ASSET / "masks.npz") as z:
+        truth = unpack(z)
+    assert iou(unpack(out.npz["masks.npz"]), truth).mean() >= 0.85
