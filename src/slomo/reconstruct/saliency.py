@@ -86,12 +86,13 @@ def _give_back_surroundings(frames: np.ndarray, layers: dict[int, np.ndarray]) -
         return 0
     model = learn_colours(frames, {k: bodies[k] for k in trusted}, reach=2.0)
     colour = {k: model(to_lab(frames[k])) for k in layers}
-    foreign = {k: float((colour[k][bodies[k]] < -1.0).mean()) for k in area}
+    foreign = {k: float((colour[k][bodies[k]] < -0.5).mean()) for k in area}
     usual_foreign = float(np.median([foreign[k] for k in trusted]))
     swallowing = [k for k in area if foreign[k] > usual_foreign + _FOREIGN]
     for k in swallowing:
-        smooth = np.clip(cv2.GaussianBlur(colour[k], (0, 0), 1.5), -4.0, 4.0)
-        logit = 4.0 * (layers[k] - 0.5) + smooth
+        # The network has shown here that it does not know, so colour outweighs it.
+        smooth = np.clip(cv2.GaussianBlur(colour[k], (0, 0), 1.5), -2.0, 2.0)
+        logit = 2.0 * (smooth - 0.5) + layers[k] - 0.5
         probability = np.where(grown(bodies[k], 0.1), 1.0 / (1.0 + np.exp(-logit)), 0.0)
         layers[k] = component_at(cut(frames[k], probability)).astype(np.float32)
     if swallowing:
