@@ -108,7 +108,11 @@ def _main(folder: str) -> None:
     reader = pycolmap.ImageReaderOptions()
     reader.mask_path = str(root / "masks")
     reader.camera_model = "SIMPLE_PINHOLE"
-    reader.camera_params = ",".join(map(str, [job["focal"], *job["center"]]))
+    if job["refine_focal"]:
+        # Not as camera_params: COLMAP would trust it, and verify pairs of frames with a wrong essential matrix.
+        reader.default_focal_length_factor = job["focal"] / (2 * max(job["center"]))
+    else:
+        reader.camera_params = ",".join(map(str, [job["focal"], *job["center"]]))
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = job["features"]
     extraction.num_threads, extraction.use_gpu = job["threads"], False
