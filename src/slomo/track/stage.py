@@ -27,7 +27,8 @@ class Config(MpcConfig):
 
     Attributes:
         mpc_hz: 1/s, a divisor of 500.
-        kp: N m/rad, kd: N m s/rad, motor PD.
+        kp: N m/rad, stiffness of the motor PD.
+        kd: N m s/rad, its damping.
         lookahead: s, how far ahead of now the joints aim on the plan.
         friction: of the simulated ground; the controller plans with its own `mu`.
         settle: s, standing still in the first pose.
