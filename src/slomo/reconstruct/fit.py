@@ -138,7 +138,7 @@ def _to_gait(
             chunk = grid[i : i + 24]
             poses = [hypotheses.gait_pose(kin, gaits[g.name], g, t, speed=root.speed, leg=leg) for g in chunk]
             guess = _lay(base, poses)
-            value = rank(problem, _pick(run.x, one.expand(len(chunk))), guess, draws=1, frames=20, pixels=160)
+            value = rank(problem, _pick(run.x, one.expand(len(chunk))), guess, draws=1, frames=16, pixels=128)
             entries += [
                 (float(v), k, g, guess.pick(torch.tensor([n])))
                 for n, (v, g) in enumerate(zip(value, chunk, strict=True))

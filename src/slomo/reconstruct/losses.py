@@ -79,7 +79,9 @@ def reach(s: State) -> Tensor:
     """How far mask pixels are from the body, and bones from the mask: gradients from afar, in units of 5 px."""
     n = s.inside
     near = s.sd[:, :, :n].amin(-1).clamp(min=0) / 5.0
-    unexplained = _frame_mean(s, torch.sqrt(near**2 + 0.01) - 0.1, torch.ones_like(s.u[:, :n]))
+    # Far pieces of a mask that swallowed something else pull less and less.
+    far = (torch.sqrt(near**2 + 0.01) - 0.1) / (1 + near / 6)
+    unexplained = _frame_mean(s, far, torch.ones_like(s.u[:, :n]))
     o, K = s.out, s.obs.K
     edge = s.obs.edge[s.seen]
     x = torch.cat([o.ua, o.ub, (o.ua + o.ub) / 2], -1) * (2 / (K.width - 1)) - 1
@@ -198,7 +200,8 @@ def limits(s: State) -> Tensor:
     """Joint angles within their anatomical ranges, and near rest by their prior; root pitch and roll small."""
     q, kin = s.q[:, :, 1:], s.kin
     over = (q - kin.upper[1:]).clamp(min=0) + (kin.lower[1:] - q).clamp(min=0)
-    rest = (q / kin.sigma[1:]).square()
+    # Sideways and twisting rotation is what a silhouette cannot deny, hence its larger weight.
+    rest = (q / kin.sigma[1:]).square() * torch.tensor([5.0, 1.0, 5.0])
     up = s.R_root[..., 2, 0].square() / 0.15**2 + s.R_root[..., 2, 1].square() / 0.08**2
     return 40 * over.square().sum(-1).mean((1, 2)) + 0.3 * rest.mean((1, 2, 3)) + 0.15 * up.mean(1)
 
