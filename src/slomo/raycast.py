@@ -133,6 +133,7 @@ class Scene:
             self._ids = wp.array(np.concatenate(ids), dtype=int)
             self._grain = wp.array(np.concatenate(grain), dtype=wp.vec2)
             self._indices = wp.array(self._faces.ravel(), dtype=int)
+        self._moves = 0
         self._build()
         self._light = LightStruct()
         sun = np.asarray(light.sun, float)
@@ -143,7 +144,6 @@ class Scene:
         self._light.hills, self._light.fog = light.hills, light.fog
 
     def _build(self) -> None:
-        # A tree that is only refitted keeps the layout of the first pose; rays then take a hundred times longer.
         with wp.ScopedDevice(self.device):
             self._mesh = wp.Mesh(wp.array(self._world, dtype=wp.vec3), self._indices)
             self._normals = wp.array(self._world_normals, dtype=wp.vec3)
@@ -160,7 +160,14 @@ class Scene:
                 self._world[s] = pose[f.ravel()] if name in self._flat else pose
                 local = np.arange(3 * len(f)).reshape(-1, 3) if name in self._flat else f
                 self._world_normals[s] = _normals(self._world[s], local)
-        self._build()
+        # A tree that is only refitted keeps the layout of an old pose, and rays may then take a hundred times longer.
+        if self._moves % 16 == 0:
+            self._build()
+        else:
+            self._mesh.points.assign(self._world)
+            self._normals.assign(self._world_normals)
+            self._mesh.refit()
+        self._moves += 1
 
     def render(self, K: np.ndarray, T_world_cam: np.ndarray, size: Sequence[int], *, supersample: int = 1) -> Image:
         """Cast supersample^2 rays a pixel. Args: K (3, 3) px; T_world_cam (4, 4); size (width, height) px."""
@@ -171,7 +178,7 @@ class Scene:
         return Image(rgb, ids.reshape(shape), depth.reshape(shape), points.reshape(*shape, 3))
 
     def picture(self, K: np.ndarray, T_world_cam: np.ndarray, size: Sequence[int]) -> np.ndarray:
-        """(H, W, 3) uint8 RGB for the eye: one ray a pixel, nine where the picture has an edge. Args as `render`."""
+        """(H, W, 3) uint8 RGB for the eye: one ray a pixel, four where the picture has an edge. Args as `render`."""
         width, height = size
         rgb, ids, _, _ = self._cast(K, T_world_cam, width, np.arange(width * height), 1)
         rgb, ids = rgb.reshape(height, width, 3), ids.reshape(height, width)
@@ -184,7 +191,7 @@ class Scene:
                 edge |= np.pad(step, grow)
         again = np.flatnonzero(edge)
         if len(again):
-            rgb[edge] = self._cast(K, T_world_cam, width, again, 3)[0].reshape(-1, 9, 3).mean(1)
+            rgb[edge] = self._cast(K, T_world_cam, width, again, 2)[0].reshape(-1, 4, 3).mean(1)
         return _display(rgb)
 
     def _cast(

@@ -5,9 +5,25 @@
 # pyright: reportAttributeAccessIssue=false, reportReturnType=false, reportInvalidTypeForm=false
 # pyright: reportGeneralTypeIssues=false
 
+import os
+
 import warp as wp
 
-wp.config.log_level = wp.LOG_ERROR  # Warp greets on stdout otherwise, where only results belong
+
+def _init_quietly() -> None:
+    """Start Warp without its greeting, nor its library's warning of a missing GPU driver: the CPU serves as well."""
+    wp.config.log_level = wp.LOG_ERROR
+    stderr, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 2)
+    try:
+        wp.init()
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        os.close(null)
+
+
+_init_quietly()
 wp.set_module_options({"enable_backward": False})
 
 

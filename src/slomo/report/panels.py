@@ -24,7 +24,7 @@ SIZE = (480, 270)  # px, width and height of a panel
 ORANGE, SKY_BLUE, GREEN = (0.90, 0.62, 0.0), (0.34, 0.71, 0.91), (0.0, 0.62, 0.45)
 BLUE, VERMILION, GREY = (0.0, 0.45, 0.70), (0.84, 0.37, 0.0), (0.55, 0.56, 0.58)
 
-_CHAINS = (
+_ANIMAL = (
     ("nose", "head", "neck", "withers", "spine_mid", "pelvis", "tail_base", "tail_tip"),
     *(
         (*root, *(f"{end}_{side}_{joint}" for joint in leg))
@@ -34,23 +34,22 @@ _CHAINS = (
         )
         for side in ("left", "right")
     ),
+)
+_HUMAN = (
     ("head_top", "head", "neck", "chest", "spine_mid", "pelvis"),
     ("head", "nose"),
     *(
-        chain
+        (root, *(f"{side}_{joint}" for joint in limb))
+        for root, limb in (("chest", ("shoulder", "elbow", "wrist")), ("pelvis", ("hip", "knee", "ankle", "toe")))
         for side in ("left", "right")
-        for chain in (
-            ("chest", f"{side}_shoulder", f"{side}_elbow", f"{side}_wrist"),
-            ("pelvis", f"{side}_hip", f"{side}_knee", f"{side}_ankle", f"{side}_toe"),
-        )
     ),
-)  # fmt: skip
+)
 
 
 def bones(names: tuple[str, ...]) -> list[tuple[int, int]]:
     """Pairs of key points to join by a line: of an animal or a human, leaving out what is not there."""
     out: dict[tuple[int, int], None] = {}
-    for chain in _CHAINS:
+    for chain in _ANIMAL if "withers" in names else _HUMAN:
         present = [names.index(n) for n in chain if n in names]
         out |= dict.fromkeys(pairwise(present))
     return list(out)
