@@ -1,5 +1,6 @@
 """The report: from artifacts of the whole line to a video, pictures and a table."""
 
+from dataclasses import fields
 from importlib.resources import files
 from pathlib import Path
 
@@ -13,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from slomo.formats.mp4 import encode_mp4
 from slomo.motion import KeypointMotion, Reference, Rollout
 from slomo.report import meshes, stage, table
-from slomo.report.panels import KeypointPanel, bones, heading
+from slomo.report.panels import KeypointPanel, RobotPanel, bones, heading
+from slomo.report.plots import foot_heights
 from slomo.report.video import Composer, FootFalls
 from slomo.robot import load_robot
 from slomo.stage import Artifact, Inputs, Silent
@@ -121,6 +123,19 @@ def test_video_is_h264_with_one_frame_for_each_time(tmp_path, artifacts, robot):
         assert float(stream.average_rate or 0) == 5
         assert sum(1 for _ in c.decode(video=0)) == 3
     assert out.json["report.json"]["reconstruction"] is None
+
+
+def test_a_fall_is_shown_even_before_the_motion_begins(artifacts, robot):
+    whole = Rollout.from_arrays(artifacts["track"].npz["rollout.npz"])
+    rows = {f.name: getattr(whole, f.name) for f in fields(whole)}
+    early = Rollout(**{k: v[:10] if isinstance(v, np.ndarray) else v for k, v in rows.items()})
+    assert early.t[-1] < 0
+    panel = RobotPanel(early, robot, Terrain(), azimuth=1.0, fell=True)
+    assert panel.draw(0.1).std() > 5
+    assert "fell" in panel.title
+    reference = Reference.from_arrays(artifacts["optimize"].npz["reference.npz"])
+    target = KeypointMotion.from_arrays(artifacts["retarget"].npz["keypoints.npz"])
+    assert foot_heights(target, reference, early, limbs=robot.limb_names, terrain=Terrain(), robot="go1")
 
 
 def test_encoding_is_deterministic_and_keeps_the_picture(tmp_path):

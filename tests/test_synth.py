@@ -14,6 +14,7 @@ from slomo.errors import InvalidData, UsageError
 from slomo.motion import KeypointMotion
 from slomo.stage import Silent
 from slomo.synth.animal import ANIMALS, BONES, FEET, KEYPOINTS, proportions, rest_joints
+from slomo.synth.clip import EMBEDDED as EMBEDDED_CONFIG
 from slomo.synth.clip import Config, truth, write_clip
 from slomo.synth.gait import GAITS, animate
 from slomo.synth.score import score
@@ -118,7 +119,9 @@ def test_a_clip_has_what_it_promises(tmp_path):
 def test_embedded_clip_is_what_its_config_renders():
     with np.load(EMBEDDED / "truth.npz") as z:
         stored = dict(z)
-    again = truth(Config(**json.loads(str(stored["config"]))))
+    config = Config(**json.loads(str(stored["config"])))
+    assert config == EMBEDDED_CONFIG
+    again = truth(config)
     assert set(again) == set(stored)
     for k in ("keypoints", "T_world_cam", "K", "body_length"):
         np.testing.assert_allclose(again[k], stored[k], atol=1e-9)
