@@ -126,13 +126,16 @@ def _main(folder: str) -> None:
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads, matching.use_gpu = job["threads"], False
     pairing = pycolmap.SequentialPairingOptions()
-    pairing.overlap, pairing.quadratic_overlap, pairing.num_threads = job["overlap"], False, job["threads"]
+    pairing.overlap, pairing.quadratic_overlap, pairing.num_threads = job["overlap"], True, job["threads"]
     pycolmap.match_sequential(database, matching_options=matching, pairing_options=pairing)
     mapping = pycolmap.IncrementalPipelineOptions()
     mapping.num_threads, mapping.random_seed = job["threads"], job["seed"]
     # A first pair that leads nowhere is dropped and another is tried, which only happens with several models.
     mapping.multiple_models, mapping.max_num_models, mapping.extract_colors = True, 3, False
     mapping.max_runtime_seconds = job["seconds"]
+    # Hand-held clips turn more than they travel: COLMAP's usual angles (1.5 and 16 degrees) leave them without points.
+    mapping.mapper.filter_min_tri_angle = mapping.triangulation.min_angle = 0.4
+    mapping.mapper.init_min_tri_angle = 4.0
     mapping.ba_refine_focal_length = job["refine_focal"]
     models = pycolmap.incremental_mapping(database, images, root, mapping)
     if models:
