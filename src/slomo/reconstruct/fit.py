@@ -57,10 +57,7 @@ def fit(problem: Problem, root: RootGuess, effort: Effort, *, metres: float, see
     generator = torch.Generator().manual_seed(seed)
     run, start, adam_state = _restore(progress.load(), generator)
     if run is None:
-        guess, names = hypotheses.heading_guess(problem.kin, root, len(problem.obs.t))
-        x = problem.variables(len(names), generator)
-        x["shape.log_length"] += math.log(root.length)
-        run = Run(0, x, guess, [{"heading": n} for n in names])
+        run = _start(problem, root, generator)
     total = total_cost(effort)
     while True:
         schedule = effort.schedules[run.phase]
@@ -87,6 +84,34 @@ def fit(problem: Problem, root: RootGuess, effort: Effort, *, metres: float, see
 
 def _cost(schedule: Schedule) -> float:
     return schedule.frames * schedule.pixels + 2000
+
+
+def _start(problem: Problem, root: RootGuess, generator: torch.Generator) -> Run:
+    """Every heading with the size and the posture that fit the masks best as they are: a raised tail or a lowered head
+    changes the height from which the size was guessed, and a raised tail looks like a neck."""
+    postures, posture_names = hypotheses.posture_angles(problem.kin)
+    n = len(postures)
+    tried: list[tuple[Tensor, list[Guess], list[dict]]] = []
+    sizes = (1.0, 0.8)
+    one = problem.variables(1, generator)
+    for size in sizes:
+        scaled = replace(root, length=root.length * size)
+        guess, names = hypotheses.heading_guess(problem.kin, scaled, len(problem.obs.t))
+        x = _pick(one, torch.zeros(n, dtype=torch.long))
+        x["shape.log_length"] += math.log(scaled.length)
+        values, guesses, labels = [], [], []
+        for k, name in enumerate(names):
+            wide = guess.pick(torch.full((n,), k))
+            posed = replace(wide, q=wide.q + postures[:, None])
+            value = rank(problem, x, posed, draws=1, frames=12, pixels=128)
+            values.append(value.min())
+            guesses.append(posed.pick(value.argmin()[None]))
+            labels.append({"heading": name, "size": size, "posture": posture_names[int(value.argmin())]})
+        tried.append((torch.stack(values), guesses, labels))
+    best = torch.stack([v for v, _, _ in tried]).argmin(0).tolist()
+    x = _pick(one, torch.zeros(len(best), dtype=torch.long))
+    x["shape.log_length"] += torch.tensor([math.log(root.length * sizes[b]) for b in best])
+    return Run(0, x, _join([tried[b][1][k] for k, b in enumerate(best)]), [tried[b][2][k] for k, b in enumerate(best)])
 
 
 def total_cost(effort: Effort) -> float:
@@ -129,7 +154,8 @@ def _to_gait(
         one = torch.tensor([k])
         base = run.guess.pick(one)
         wide = base.pick(torch.zeros(len(postures), dtype=torch.long))
-        guess = replace(wide, q=wide.q + postures[:, None])
+        # In place of the posture it began with.
+        guess = replace(wide, q=postures[:, None].expand(-1, wide.q.shape[1], -1, -1).contiguous())
         value = rank(problem, _pick(run.x, one.expand(len(postures))), guess, draws=2, frames=12, pixels=200)
         base = guess.pick(value.argmin()[None])
         run.labels[k] = run.labels[k] | {"posture": posture_names[int(value.argmin())]}

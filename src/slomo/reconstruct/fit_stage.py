@@ -63,7 +63,7 @@ class FitConfig:
     weight_ground: float = 0.3
     weight_limits: float = 0.05
     weight_smooth: float = 0.02
-    weight_forward: float = 0.05
+    weight_forward: float = 0.25
     weight_prior: float = 0.05
 
     def __post_init__(self):
