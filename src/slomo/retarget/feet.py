@@ -43,15 +43,20 @@ def stance(lift: np.ndarray, speed: np.ndarray, *, dt: float, clearance: float, 
 
     Args:
         lift: (T, F) m over the foot's floor.  speed: (T, F) m/s, horizontal.
-        dt: s.  clearance: m, a foot lifted more than this swings.  shortest: s, shorter stances and swings are noise.
+        dt: s.  clearance: m, a foot lifted more than this swings.  shortest: s, see `settled`.
 
     Returns:
         (T, F) bool.
     """
     swing = np.percentile(speed, 95, axis=0)
     slow = speed < np.maximum(0.35 * swing, 0.12)
-    n = max(1, round(shortest / dt)) | 1
-    return median_filter((slow & (lift < clearance)).astype(np.uint8), (n, 1), mode="nearest").astype(bool)
+    return settled(slow & (lift < clearance), dt=dt, shortest=shortest)
+
+
+def settled(standing: np.ndarray, *, dt: float, shortest: float) -> np.ndarray:
+    """(T, F) bool without stances and swings shorter than `shortest` (s)."""
+    n = 2 * round(shortest / dt) | 1
+    return median_filter(standing.astype(np.uint8), (n, 1), mode="nearest").astype(bool)
 
 
 def runs(standing: np.ndarray) -> Intervals:

@@ -19,7 +19,7 @@ from slomo.robot import Robot
 from slomo.stage import Artifact, Inputs, Progress
 from slomo.terrain import Box, Terrain
 
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Config:
 _MAX_LEVEL = 0.35  # rad, key points misplaced by more than this are a posture, not a misplacement
 _MAX_TILT = 0.6  # rad, roll and pitch that a legged robot can follow
 _CLEARANCE = 0.10  # of the standing height: a foot lifted more than this swings
-_SHORTEST = 0.10  # s
+_SHORTEST = 0.08  # s, shorter stances and swings are noise
 _CREEP = 0.2  # of the standing height: a standing foot that creeps further takes a step
 _MARGIN = 0.15  # s, left out beside an impossible turn
 _STEP = 0.24  # s, duration of such a step
@@ -231,7 +231,7 @@ def _standing(
         for f, name in enumerate(paws):
             if name in motion.contact_names:
                 standing[:, f] = motion.contact[:, motion.contact_names.index(name)] > 0.5
-    return standing
+    return feet.settled(standing, dt=dt, shortest=_SHORTEST)
 
 
 def _level(trunk: Trunk, config: Config, robot: Robot) -> tuple[Trunk, list[float]]:
