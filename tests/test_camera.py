@@ -100,19 +100,21 @@ def test_static_camera_keeps_the_given_focal():
 def test_ground_is_the_low_plane_and_not_the_wall():
     rng = np.random.default_rng(1)
     tilt = Rotation.from_euler("xy", [0.3, 0.1]).as_matrix()
+    looking = Rotation.from_euler("x", -100, degrees=True).as_matrix()  # along y, ten degrees down
+    axes = tilt @ looking
     ground = np.column_stack([rng.uniform(-3, 3, (300, 2)), rng.normal(0, 0.01, 300)])
     wall = np.column_stack([rng.uniform(-3, 3, 500), np.full(500, 4.0), rng.uniform(0, 3, 500)])
     table = np.column_stack([rng.uniform(0, 2, (350, 2)), np.full(350, 0.7)])
     points = np.concatenate([ground, wall, table]) @ tilt.T
     centers = np.array([[0, -3.0, 1.2], [0.3, -3.0, 1.25]]) @ tilt.T
-    plane = find_ground(points, np.ones(len(points)), np.array([0, 0, 1.0]), centers)
+    plane = find_ground(points, np.ones(len(points)), axes, centers)
     assert plane is not None
     assert np.degrees(np.arccos(plane.normal @ tilt[:, 2])) < 0.5
     assert abs(plane.offset) < 0.02
 
 
 def test_no_ground_among_few_points():
-    assert find_ground(np.zeros((5, 3)), np.ones(5), np.array([0, 0, 1.0]), np.ones((2, 3))) is None
+    assert find_ground(np.zeros((5, 3)), np.ones(5), np.eye(3), np.ones((2, 3))) is None
 
 
 @pytest.mark.parametrize(("pitch", "roll"), [(20.0, 3.0), (5.0, -4.0), (-4.0, 1.0)])

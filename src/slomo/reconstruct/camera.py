@@ -9,12 +9,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from slomo.reconstruct import ground, resection, rotation_ba, sfm
 from slomo.reconstruct.tracks import Tracks, background_tracks
 
 _STATIC_PX = 0.7  # px, background displacement below which a camera stands still (at 640 px; noise of the tracks)
 _PARALLAX_PX = 0.5  # px, residual of the turning camera over a second and more, above which there is parallax
+_GROUND_SUPPORT = 0.08  # part of the weight of all sparse points that a plane needs to be taken for the ground
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ def estimate_camera(
         progress.update(0.8, "structure from motion")
         registered = 0 if structure is None else len(structure.frames)
         report |= {"key_frames": len(keys), "key_frames_registered": registered}
-        if structure is not None and registered >= 0.6 * len(keys):
+        if structure is not None and registered >= sfm.ENOUGH * len(keys):
             progress.note(
                 f"camera: moving (structure from motion, {registered} of {len(keys)} key frames, "
                 f"{structure.error_px:.2f} px, focal {structure.focal:.0f} px)"
@@ -191,9 +193,9 @@ def _turning(frames, masks, R: np.ndarray, focal: float, center: np.ndarray, rep
 def _moving(frames, masks, structure: sfm.Structure, center: np.ndarray, report: dict[str, Any]) -> CameraPath:
     K = _intrinsics(structure.focal, center)
     path, measured = resection.camera_path(frames, structure, K)
-    rough_up = -path[:, :3, 1].mean(0)
-    plane = ground.find_ground(structure.points, _near_feet(structure, masks), rough_up, path[:, :3, 3])
-    if plane is not None:
+    axes = Rotation.from_matrix(path[:, :3, :3]).mean().as_matrix()
+    plane = ground.find_ground(structure.points, _near_feet(structure, masks), axes, path[:, :3, 3])
+    if plane is not None and plane.support > _GROUND_SUPPORT:
         up, offset = plane.normal, plane.offset
         report |= {
             "up_source": "ground plane",
@@ -219,13 +221,14 @@ def _moving(frames, masks, structure: sfm.Structure, center: np.ndarray, report:
         "focal_observed": True,
         "frames_measured": int(measured.sum()),
         "sparse_points": len(structure.points),
+        "least_angle_deg": structure.least_angle,
         "scale_source": "mean camera height over the ground set to 1",
     }
     return CameraPath(K, T, report)
 
 
 def _near_feet(structure: sfm.Structure, masks: np.ndarray) -> np.ndarray:
-    """(P,) weight of each sparse point: how near it is ever seen to the lowest point of the subject's mask."""
+    """(P,) weight of each sparse point: how near it is seen to the mask's lowest point, and how sure its depth is."""
     weight = np.full(len(structure.points), 0.05)
     size = 0.25 * max(masks.shape[1:])
     for n, t in enumerate(structure.frames):
@@ -237,4 +240,15 @@ def _near_feet(structure: sfm.Structure, masks: np.ndarray) -> np.ndarray:
         rows = structure.observations[:, 0] == n
         near = np.exp(-0.5 * np.sum((structure.xy[rows] - foot) ** 2, axis=-1) / size**2)
         np.maximum.at(weight, structure.observations[rows, 1], near)
-    return weight
+    return weight * np.minimum(1.0, _parallax(structure) / np.radians(2.0)) ** 2
+
+
+def _parallax(structure: sfm.Structure) -> np.ndarray:
+    """(P,) rad, angle between the rays to each point from the first and the last frame that see it."""
+    centers = structure.T_world_cam[:, :3, 3]
+    first, last = np.full(len(structure.points), len(centers) - 1), np.zeros(len(structure.points), int)
+    np.minimum.at(first, structure.observations[:, 1], structure.observations[:, 0])
+    np.maximum.at(last, structure.observations[:, 1], structure.observations[:, 0])
+    a, b = (centers[n] - structure.points for n in (first, last))
+    cosine = (a * b).sum(-1) / np.maximum(np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1), 1e-12)
+    return np.arccos(np.clip(cosine, -1.0, 1.0))

@@ -23,24 +23,18 @@ class Plane:
 
 
 def find_ground(
-    points: np.ndarray,
-    weights: np.ndarray,
-    up: np.ndarray,
-    centers: np.ndarray,
-    *,
-    max_tilt: float = 0.8,
-    seed: int = 0,
+    points: np.ndarray, weights: np.ndarray, axes: np.ndarray, centers: np.ndarray, *, seed: int = 0
 ) -> Plane | None:
-    """RANSAC for the ground: below all cameras, its normal within `max_tilt` rad of `up`, most points on it.
+    """RANSAC for the ground: below all cameras, seen at a likely pitch and roll, with most points on it.
 
     Args:
         points: (P, 3) sparse points.  weights: (P,) how near each lies to where the subject stands.
-        up: (3,) rough up (the mean of the images').  centers: (T, 3) camera centres.
+        axes: (3, 3) mean R_world_cam (columns right, down, forward).  centers: (T, 3) camera centres.
     """
     if len(points) < 20:
         return None
     rng = np.random.default_rng(seed)
-    origin = centers.mean(0)
+    up, origin = -axes[:, 1], centers.mean(0)
     distance = np.linalg.norm(points - origin, axis=-1)
     tolerance = 0.006 * distance  # depth of a sparse point is the less certain the farther it is
     best, best_score = None, 0.0
@@ -52,11 +46,13 @@ def find_ground(
         if size < 1e-9 * distance.max() ** 2:
             continue
         normal /= size * np.sign(normal @ up or 1.0)
-        if normal @ up < np.cos(max_tilt) or np.any(centers @ normal - normal @ a <= 0):
+        if np.any(centers @ normal - normal @ a <= 0):
             continue
         height = points @ normal - normal @ a
-        # What hangs below the ground speaks against it: table tops and steps have floor under them.
-        score = weights[abs(height) < tolerance].sum() - weights[height < -4 * tolerance].sum()
+        # What hangs below the ground speaks against it (table tops have floor under them), though less than what lies
+        # on it speaks for it: shining floors mirror the room.
+        score = weights[abs(height) < tolerance].sum() - 0.5 * weights[height < -4 * tolerance].sum()
+        score *= _likely(axes.T @ normal)
         if score > best_score:
             best, best_score = (normal, float(normal @ a)), score
     if best is None:
@@ -76,6 +72,12 @@ def find_ground(
     flat = points[on] - points[on].mean(0)
     extent, noise = np.linalg.svd(flat, compute_uv=False)[1], np.std(flat @ normal)
     return Plane(normal, offset, on, float(weights[on].sum() / weights.sum()), float(noise / max(extent, 1e-12)))
+
+
+def _likely(up: np.ndarray) -> float:
+    """How likely this up (3,), camera frame, is by the prior of pitch and roll, widened twofold; 1 at best."""
+    pitch, roll = np.arcsin(np.clip(-up[2], -1, 1)), np.arctan2(-up[0], -up[1])
+    return float(np.exp(-0.125 * (((pitch - PITCH_PRIOR) / PITCH_STD) ** 2 + (roll / (2 * ROLL_STD)) ** 2)))
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,13 @@ import numpy as np
 
 from slomo.errors import StageFailed
 
+ENOUGH = 0.6  # part of the key frames that a model must hold to be used
+# Degrees between rays, of the first pair and of any point. COLMAP's usual ones give the better structure; a hand-held
+# clip that turns more than it travels has no points left at those.
+_ANGLES = ((16.0, 1.5), (4.0, 0.4))
+_ENOUGH_POINTS = 10  # points for each key frame, below which the next angles are tried
+_MAX_SECONDS = 90
+
 
 @dataclass(frozen=True)
 class Structure:
@@ -28,6 +35,7 @@ class Structure:
         points: (P, 3).
         observations: (M, 2) int rows (place in `frames`, point).  xy: (M, 2) px, pixel centres at integers.
         error_px: mean reprojection error.
+        least_angle: degrees, least angle between rays at which points were accepted.
     """
 
     frames: np.ndarray
@@ -37,6 +45,7 @@ class Structure:
     observations: np.ndarray
     xy: np.ndarray
     error_px: float
+    least_angle: float
 
 
 def reconstruct_structure(
@@ -80,7 +89,6 @@ def reconstruct_structure(
             "overlap": overlap,
             "seed": seed,
             "threads": threads,
-            "seconds": 90,
         }
         (root / "job.json").write_text(json.dumps(job))
         done = subprocess.run(
@@ -128,19 +136,27 @@ def _main(folder: str) -> None:
     pairing = pycolmap.SequentialPairingOptions()
     pairing.overlap, pairing.quadratic_overlap, pairing.num_threads = job["overlap"], True, job["threads"]
     pycolmap.match_sequential(database, matching_options=matching, pairing_options=pairing)
-    mapping = pycolmap.IncrementalPipelineOptions()
-    mapping.num_threads, mapping.random_seed = job["threads"], job["seed"]
-    # A first pair that leads nowhere is dropped and another is tried, which only happens with several models.
-    mapping.multiple_models, mapping.max_num_models, mapping.extract_colors = True, 3, False
-    mapping.max_runtime_seconds = job["seconds"]
-    # Hand-held clips turn more than they travel: COLMAP's usual angles (1.5 and 16 degrees) leave them without points.
-    mapping.mapper.filter_min_tri_angle = mapping.triangulation.min_angle = 0.4
-    mapping.mapper.init_min_tri_angle = 4.0
-    mapping.ba_refine_focal_length = job["refine_focal"]
-    models = pycolmap.incremental_mapping(database, images, root, mapping)
-    if models:
-        model = max(models.values(), key=lambda m: m.num_reg_images())
-        np.savez(root / "out.npz", allow_pickle=False, **_arrays(model))
+    count = len(list(images.iterdir()))
+    best, best_rank = None, (False, False, 0)
+    for first_angle, angle in _ANGLES:
+        mapping = pycolmap.IncrementalPipelineOptions()
+        mapping.num_threads, mapping.random_seed = job["threads"], job["seed"]
+        # A first pair that leads nowhere is dropped and another is tried, which only happens with several models.
+        mapping.multiple_models, mapping.max_num_models, mapping.extract_colors = True, 3, False
+        mapping.max_runtime_seconds = _MAX_SECONDS
+        mapping.mapper.filter_min_tri_angle = mapping.triangulation.min_angle = angle
+        mapping.mapper.init_min_tri_angle = first_angle
+        mapping.ba_refine_focal_length = job["refine_focal"]
+        models = pycolmap.incremental_mapping(database, images, root, mapping)
+        for model in models.values():
+            registered = model.num_reg_images()
+            rank = (registered >= ENOUGH * count, model.num_points3D() >= _ENOUGH_POINTS * registered, registered)
+            if rank[:2] > best_rank[:2] or (rank[:2] == best_rank[:2] == (False, False) and rank > best_rank):
+                best, best_rank = (model, angle), rank
+        if all(best_rank[:2]):
+            break
+    if best:
+        np.savez(root / "out.npz", allow_pickle=False, least_angle=np.array(best[1]), **_arrays(best[0]))
 
 
 def _arrays(model) -> dict[str, np.ndarray]:
