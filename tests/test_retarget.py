@@ -130,3 +130,15 @@ def test_smoother_keeps_slow_sines_and_halves_at_the_cutoff():
         y = clean.smooth(x, np.ones(len(t)), dt=dt, cutoff=4.0)
         middle = slice(150, -150)
         assert np.sum(x[middle] * y[middle]) / np.sum(x[middle] ** 2) == pytest.approx(gain, abs=0.12)
+
+
+def test_creep_at_an_end_of_a_stance_is_swing_and_a_shuffle_is_a_step():
+    dt, T = 0.02, 100
+    x = np.zeros((T, 2))
+    x[:10, 0] = np.linspace(-0.3, 0, 10)  # still landing
+    standing = np.ones(T, bool)
+    trimmed = feet.split(x, standing, dt=dt, tolerance=0.05, step=0.24)
+    assert feet.runs(trimmed) == [(9, T)] or feet.runs(trimmed) == [(8, T)]
+    x[:, 0] = 0.3 / (1 + np.exp(-(np.arange(T) - 50) / 3))
+    (_, end), (start, _) = feet.runs(feet.split(x, standing, dt=dt, tolerance=0.05, step=0.24))
+    assert end < 50 < start

@@ -96,9 +96,10 @@ def slide(xy: np.ndarray, weight: np.ndarray, *, dt: float, smoothing: float) ->
 
 
 def split(xy: np.ndarray, standing: np.ndarray, *, dt: float, tolerance: float, step: float) -> np.ndarray:
-    """Break stances during which a foot creeps further than 2 * `tolerance` (m) by steps of `step` (s).
+    """Take creeping out of stances: a standing foot stays within `tolerance` (m) of its stance's median place.
 
-    A foot cannot creep; where the creature shuffled, the robot takes a step at the moment of fastest creep.
+    Creeping at either end of a stance belongs to the swing beside it. What still creeps is two stances with a step of
+    `step` (s) between, at the moment of fastest creep: there the creature shuffled.
 
     Args:
         xy: (T, 2) m, path of one foot.  standing: (T,) bool.
@@ -112,12 +113,18 @@ def split(xy: np.ndarray, standing: np.ndarray, *, dt: float, tolerance: float, 
     todo = runs(standing)
     while todo:
         start, end = todo.pop()
-        part = xy[start:end]
-        if end - start < 6 * half or np.linalg.norm(part - np.median(part, axis=0), axis=1).max() <= tolerance:
+        away = np.linalg.norm(xy[start:end] - np.median(xy[start:end], axis=0), axis=1) > tolerance
+        if not away.any():
             continue
-        middle = start + 2 * half + int(np.argmax(speed[start + 2 * half : end - 2 * half]))
-        out[middle - half : middle + half] = False
-        todo += [(start, middle - half), (middle + half, end)]
+        near = np.flatnonzero(~away)
+        first, last = (start + int(near[0]), start + int(near[-1]) + 1) if len(near) else (start, end)
+        if (first, last) != (start, end) and 2 * (last - first) > end - start:
+            out[start:first] = out[last:end] = False
+            todo.append((first, last))
+        elif end - start >= 6 * half:
+            middle = start + 2 * half + int(np.argmax(speed[start + 2 * half : end - 2 * half]))
+            out[middle - half : middle + half] = False
+            todo += [(start, middle - half), (middle + half, end)]
     return out
 
 

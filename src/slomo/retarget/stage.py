@@ -19,7 +19,7 @@ from slomo.robot import Robot
 from slomo.stage import Artifact, Inputs, Progress
 from slomo.terrain import Box, Terrain
 
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True)
