@@ -10,7 +10,7 @@ from slomo.reconstruct.flow import Flow, sample
 from slomo.reconstruct.segment import Masks, Report, blend_over_time, box_of, component_at, grown, no_subject
 from slomo.reconstruct.u2net import U2Net
 
-_FOREIGN = 0.1  # part of a mask with the surroundings' colours, above the usual, from which on it is cut anew
+_FOREIGN = 0.17  # part of a mask in patches of the surroundings' colours, from which on it is cut anew
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,8 @@ def _give_back_surroundings(frames: np.ndarray, layers: dict[int, np.ndarray]) -
     """Take out of `layers`, in place, what the network added of furniture and the like. Returns the frames concerned.
 
     Colours are learned from the quarter of the masks that are smallest (though no slivers), against their
-    surroundings. A mask a good part of which has the colours of those surroundings is cut anew with them; what then is
-    left without most of the usual area says nothing and is dropped, for the frames next to it to fill.
+    surroundings. A mask a good part of which is patches of the colours of those surroundings is cut anew with them;
+    what then is left without most of the usual area says nothing and is dropped, for the frames next to it to fill.
     """
     bodies = {k: component_at(p > 0.5) for k, p in layers.items()}
     area = {k: int(b.sum()) for k, b in bodies.items() if b.any()}
@@ -85,14 +85,11 @@ def _give_back_surroundings(frames: np.ndarray, layers: dict[int, np.ndarray]) -
     if len(trusted) < 2:
         return 0
     model = learn_colours(frames, {k: bodies[k] for k in trusted}, reach=2.0)
-    colour = {k: model(to_lab(frames[k])) for k in layers}
-    foreign = {k: float((colour[k][bodies[k]] < -0.5).mean()) for k in area}
-    usual_foreign = float(np.median([foreign[k] for k in trusted]))
-    swallowing = [k for k in area if foreign[k] > usual_foreign + _FOREIGN]
+    colour = {k: cv2.GaussianBlur(model(to_lab(frames[k])), (0, 0), 1.5) for k in layers}
+    swallowing = [k for k in area if _foreign(bodies[k], colour[k]) > _FOREIGN]
     for k in swallowing:
         # The network has shown here that it does not know, so colour outweighs it.
-        smooth = np.clip(cv2.GaussianBlur(colour[k], (0, 0), 1.5), -2.0, 2.0)
-        logit = 2.0 * (smooth - 0.5) + layers[k] - 0.5
+        logit = 2.0 * (np.clip(colour[k], -2.0, 2.0) - 0.5) + layers[k] - 0.5
         probability = np.where(grown(bodies[k], 0.1), 1.0 / (1.0 + np.exp(-logit)), 0.0)
         layers[k] = component_at(cut(frames[k], probability)).astype(np.float32)
     if swallowing:
@@ -102,6 +99,14 @@ def _give_back_surroundings(frames: np.ndarray, layers: dict[int, np.ndarray]) -
             if left[k] < 0.5 * trusted_area and len(layers) > len(left) // 3:
                 del layers[k]
     return len(swallowing)
+
+
+def _foreign(body: np.ndarray, colour: np.ndarray) -> float:
+    """Part of a mask that is whole patches of the surroundings' colours; the speckles of a coat do not count."""
+    radius = max(1, round(0.06 * np.sqrt(body.sum())))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    patches = cv2.morphologyEx((body & (colour < -0.5)).astype(np.uint8), cv2.MORPH_OPEN, disc)
+    return float(patches.sum() / body.sum())
 
 
 def _clarity(probability: np.ndarray) -> float:
