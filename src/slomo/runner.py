@@ -88,7 +88,15 @@ class Runner:
                 if failed is None or (STAGES[stage].inspects and len(before) == len(self.project.upstream(stage))):
                     done[stage] = self._ensure(stage, before, touch=stage == last)
                     failed = failed or (done[stage] if done[stage]["failure"] else None)
+        if len(done) > 1:
+            self._say_times(done)
         return failed or done[last]
+
+    def _say_times(self, done: Mapping[str, Manifest]) -> None:
+        """One line with the time that each artifact took when it was made, now or before."""
+        took = {name: float(m["seconds"]) for name, m in done.items()}
+        parts = ", ".join(f"{name} {seconds:.1f}" for name, seconds in took.items())
+        self.console.note(f"time: {parts}; together {sum(took.values()):.1f} s")
 
     def make_only(self, stage: str, *, show: bool = False) -> Manifest:
         """`stage`, from artifacts that are there; with `show` the report too, even of a failure.
