@@ -14,10 +14,10 @@ from scipy.ndimage import binary_dilation
 from slomo.errors import InvalidData, UsageError
 from slomo.motion import KeypointMotion
 from slomo.retarget import clean, feet
+from slomo.retarget.footprint import footprint, make_terrain, start_at_origin
 from slomo.retarget.trunk import Trunk, trunk_frame
 from slomo.robot import Robot
 from slomo.stage import Artifact, Inputs, Progress
-from slomo.terrain import Box, Terrain
 
 VERSION = 3
 
@@ -105,7 +105,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     drift = drift + feet.slide(xy - drift[:, None], standing.astype(float), dt=dt, smoothing=0.1)
     xy, base_xy = xy - drift[:, None], base_xy - drift
     trunk, report["leveled_rad"] = _level(trunk, config, robot)
-    xy, base_xy, stride = _footprint(xy, base_xy, trunk.yaw, standing, robot)
+    xy, base_xy, stride = footprint(xy, base_xy, trunk.yaw, standing, robot)
     creep = _CREEP * robot.standing_height
     standing = np.stack(
         [
@@ -115,9 +115,9 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
         axis=1,
     )
     xy = np.stack([feet.anchor(xy[:, f], standing[:, f]) for f in range(len(paws))], axis=1)
-    xy, base_xy, trunk = _start_at_origin(xy, base_xy, trunk)
+    xy, base_xy, trunk = start_at_origin(xy, base_xy, trunk)
     progress.update(0.7, "terrain")
-    terrain = _terrain(xy, standing, robot, config)
+    terrain = make_terrain(xy, robot, step_height=config.step_height, step_limbs=config.step_limbs)
     under = terrain.height(xy)
     lift = np.stack([feet.clear(z, on, least=clearance) for z, on in zip(lift.T, standing.T, strict=True)], axis=1)
     bounce = scale * (rise - height)
@@ -193,7 +193,7 @@ def _prepare(source: KeypointMotion, config: Config, report: dict[str, Any], pro
     if keep.stop - keep.start < 0.5 * config.rate:
         raise InvalidData(
             f"no half second without turns faster than {config.max_turn_rate} rad/s", where="key points",
-            todo="choose a part with --start and --end",
+            todo="choose a part with --set retarget.start=... and retarget.end=...",
         )  # fmt: skip
     kept = clean.cut(motion, keep)
     report["used_s"] = [float(kept.t[0]), float(kept.t[-1])]
@@ -249,57 +249,6 @@ def _level(trunk: Trunk, config: Config, robot: Robot) -> tuple[Trunk, list[floa
         pitch=np.clip(trunk.pitch - bias[1], -_MAX_TILT, _MAX_TILT),
         roll=np.clip(trunk.roll - bias[0], -_MAX_TILT, _MAX_TILT),
     ), bias.tolist()
-
-
-def _footprint(
-    xy: np.ndarray, base: np.ndarray, yaw: np.ndarray, standing: np.ndarray, robot: Robot
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Stance width and length of the robot, strides of the creature, shortened where legs would not reach.
-
-    Each foot is shifted by a constant in the heading frame, so that its median stance place lies under the robot's hip.
-    One factor on the path of body and feet alike keeps standing feet standing.
-    """
-    c, s = np.cos(yaw), np.sin(yaw)
-    R = np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
-    relative = np.einsum("tji,tfj->tfi", R, xy - base[:, None])
-    centre = np.stack(
-        [np.median(x[on] if on.any() else x, axis=0) for x, on in zip(relative.swapaxes(0, 1), standing.T, strict=True)]
-    )
-    excursion = float(np.percentile(np.linalg.norm(relative - centre, axis=2), 95))
-    length = 0.95 * float(robot.leg_reach[:, 1].min())
-    room = 0.8 * np.sqrt(max(length**2 - robot.standing_height**2, 0.0))
-    stride = min(1.0, room / excursion) if excursion > 0 else 1.0
-    shift = robot.nominal_hips[:, :2] - stride * centre
-    return stride * xy + np.einsum("tij,fj->tfi", R, shift), stride * base, stride
-
-
-def _start_at_origin(xy: np.ndarray, base: np.ndarray, trunk: Trunk) -> tuple[np.ndarray, np.ndarray, Trunk]:
-    """The robot starts at the origin and looks along x."""
-    c, s = np.cos(trunk.yaw[0]), np.sin(trunk.yaw[0])
-    R = np.array([[c, s], [-s, c]])
-    moved = Trunk(origin=trunk.origin, yaw=trunk.yaw - trunk.yaw[0], pitch=trunk.pitch, roll=trunk.roll)
-    return (xy - base[0]) @ R.T, (base - base[0]) @ R.T, moved
-
-
-def _terrain(xy: np.ndarray, standing: np.ndarray, robot: Robot, config: Config) -> Terrain:
-    """A step in front of the feet that stand on the ground and under those that stand on it."""
-    if config.step_height == 0:
-        return Terrain()
-    unknown = [n for n in config.step_limbs if n not in robot.limb_names]
-    if unknown or not config.step_limbs:
-        raise UsageError(f"no limb {unknown or config.step_limbs}", where="retarget.step_limbs", valid=robot.limb_names)
-    on = np.array([n in config.step_limbs for n in robot.limb_names])
-    behind = float(xy[:, ~on, 0].max())
-    ahead = float(xy[:, on, 0].min())
-    if ahead - behind < 0.06:
-        raise InvalidData(
-            f"a step under {', '.join(config.step_limbs)} does not fit: feet off it reach x = {behind:.2f} m and "
-            f"feet on it come back to {ahead:.2f} m", where="retarget.step_height",
-            todo="choose a part with --start and --end",
-        )  # fmt: skip
-    edge = (behind + ahead) / 2
-    far, wide = float(xy[..., 0].max()) + 0.5, float(np.abs(xy[..., 1]).max()) + 0.5
-    return Terrain((Box(edge, far, -wide, wide, config.step_height),))
 
 
 def _motion(
