@@ -28,5 +28,8 @@ def load_keypoints(path: Path, *, note: Callable[[str], None] = lambda message: 
     if not start:
         raise InvalidData("the file is empty", where=path, todo="give keypoints.npz or a key-point JSON")
     if start == b"PK":
-        return KeypointMotion.from_arrays(npz.load(path))
+        try:
+            return KeypointMotion.from_arrays(npz.load(path))
+        except InvalidData as e:
+            raise e if str(path) in str(e) else InvalidData(str(e), where=path) from None
     return paper.load(path, note=note)
