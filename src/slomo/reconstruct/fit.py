@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 import torch
 
-from slomo.reconstruct import hypotheses
+from slomo.reconstruct import hypotheses, pose_track
 from slomo.reconstruct.hypotheses import GaitHypothesis, RootGuess
 from slomo.reconstruct.problem import Problem, Schedule, Variables, optimise
 from slomo.reconstruct.trajectory import Guess
@@ -89,6 +89,8 @@ def _cost(schedule: Schedule) -> float:
 def _start(problem: Problem, root: RootGuess, generator: torch.Generator) -> Run:
     """Every heading with the size and the posture that fit the masks best as they are: a raised tail or a lowered head
     changes the height from which the size was guessed, and a raised tail looks like a neck."""
+    if problem.kin.skeleton.kind == "human":
+        return _start_tracked(problem, root, generator)
     postures, posture_names = hypotheses.posture_angles(problem.kin)
     n = len(postures)
     tried: list[tuple[Tensor, list[Guess], list[dict]]] = []
@@ -112,6 +114,36 @@ def _start(problem: Problem, root: RootGuess, generator: torch.Generator) -> Run
     x = _pick(one, torch.zeros(len(best), dtype=torch.long))
     x["shape.log_length"] += torch.tensor([math.log(root.length * sizes[b]) for b in best])
     return Run(0, x, _join([tried[b][1][k] for k, b in enumerate(best)]), [tried[b][2][k] for k, b in enumerate(best)])
+
+
+def _start_tracked(problem: Problem, root: RootGuess, generator: torch.Generator) -> Run:
+    """Paths through headings and postures that suit the silhouettes best, mostly seen from the front and from behind,
+    and one that faces the way of travel; each with two sizes."""
+    postures, posture_names = hypotheses.posture_angles(problem.kin)
+    one = problem.variables(1, generator)
+    T, ring = len(problem.obs.t), tuple(2 * math.pi * n / pose_track.HEADINGS for n in range(pose_track.HEADINGS))
+    guesses, labels, lengths = [], [], []
+    for size in (1.0, 0.85):
+        scaled = replace(root, length=root.length * size)
+        x = _pick(one, torch.zeros(1, dtype=torch.long))
+        x["shape.log_length"] += math.log(scaled.length)
+        any_way = hypotheses.placed(problem.kin, scaled, np.zeros((1, T)))
+        aways = (pose_track.AWAY, -pose_track.AWAY)
+        found = pose_track.tracks(problem, x, any_way, scaled, postures, turns=ring, aways=aways)
+        kinds = ["front", "back"]
+        if root.travelled > 0.7:
+            travel = hypotheses.placed(problem.kin, scaled, root.heading[None])
+            found += pose_track.tracks(problem, x, travel, scaled, postures)
+            kinds += ["travel"]
+        for kind, track in zip(kinds, found, strict=True):
+            guess = hypotheses.placed(problem.kin, scaled, track.yaw[None])
+            guesses.append(replace(guess, q=torch.as_tensor(track.q, dtype=torch.float32)[None]))
+            posture = posture_names[int(track.postures.argmax())]
+            labels.append({"heading": f"tracked, {kind}", "size": size, "posture": posture})
+            lengths.append(math.log(scaled.length))
+    x = _pick(one, torch.zeros(len(guesses), dtype=torch.long))
+    x["shape.log_length"] += torch.tensor(lengths)
+    return Run(0, x, _join(guesses), labels)
 
 
 def total_cost(effort: Effort) -> float:
@@ -153,12 +185,17 @@ def _to_gait(
     for k in keep:
         one = torch.tensor([k])
         base = run.guess.pick(one)
-        wide = base.pick(torch.zeros(len(postures), dtype=torch.long))
         # In place of the posture it began with.
-        guess = replace(wide, q=postures[:, None].expand(-1, wide.q.shape[1], -1, -1).contiguous())
-        value = rank(problem, _pick(run.x, one.expand(len(postures))), guess, draws=2, frames=12, pixels=200)
-        base = guess.pick(value.argmin()[None])
-        run.labels[k] = run.labels[k] | {"posture": posture_names[int(value.argmin())]}
+        if skeleton.kind == "human":
+            track = pose_track.tracks(problem, _pick(run.x, one), base, root, postures)[0]
+            base = replace(base, q=torch.as_tensor(track.q, dtype=torch.float32)[None])
+            best = int(track.postures.argmax())
+        else:
+            wide = base.pick(torch.zeros(len(postures), dtype=torch.long))
+            guess = replace(wide, q=postures[:, None].expand(-1, wide.q.shape[1], -1, -1).contiguous())
+            value = rank(problem, _pick(run.x, one.expand(len(postures))), guess, draws=2, frames=12, pixels=200)
+            base, best = guess.pick(value.argmin()[None]), int(value.argmin())
+        run.labels[k] = run.labels[k] | {"posture": posture_names[best]}
         posed.append(base)
         for i in range(0, len(grid), 24):
             chunk = grid[i : i + 24]

@@ -20,7 +20,7 @@ from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import Skeleton, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 1
+FIT_VERSION = 2
 
 # The rest pose at the right place overlaps by 0.5 to 0.6, a fit that is right by 0.75 and more. Below this the body is
 # elsewhere or another shape in many frames, and its key points do not follow the subject.
@@ -40,7 +40,7 @@ class FitConfig:
         iterations: of the heading, gait, rivals and final phase.
         candidates: hypotheses that are fitted in the gait phase; gait_phases: phases tried of each gait.
         tilt_moving_deg, tilt_static_deg: s.d. of the given gravity for a camera that moved, and for one that did not.
-        weight_*: of the evidence; 0 switches a term off.
+        weight_*: of the evidence; 0 switches a term off. `facing` is for people only.
     """
 
     skeleton: str = "quadruped"
@@ -65,6 +65,7 @@ class FitConfig:
     weight_smooth: float = 0.02
     weight_forward: float = 0.25
     weight_prior: float = 0.05
+    weight_facing: float = 0.05
 
     def __post_init__(self):
         if self.length_m < 0:
@@ -97,7 +98,10 @@ def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
     kin = Kinematics(skeleton)
     path = Trajectory(obs.t, kin.B, joint_hz=config.joint_hz, root_hz=config.root_hz, width=config.width)
     spread = np.radians(config.tilt_moving_deg if mode == "moving" else config.tilt_static_deg)
-    problem = Problem(obs, kin, path, config.weights(), float(spread))
+    weights = config.weights()
+    if skeleton.kind != "human":
+        weights["facing"] = 0.0
+    problem = Problem(obs, kin, path, weights, float(spread))
     root = hypotheses.root_guess(obs, skeleton)
     metres = config.length_m or skeleton.typical_length
     with _one_thread():

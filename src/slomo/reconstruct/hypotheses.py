@@ -109,17 +109,21 @@ def heading_guess(kin: Kinematics, root: RootGuess, T: int) -> tuple[Guess, list
         for n in range(8):
             yaws.append(np.full(T, n * math.pi / 4))
             names.append(f"{n * 45}")
-    yaw = np.stack(yaws)
+    return placed(kin, root, np.stack(yaws)), names
+
+
+def placed(kin: Kinematics, root: RootGuess, yaw: Array) -> Guess:
+    """Rest poses along the path with headings yaw (H, T) rad."""
     s = kin.skeleton
     middle = float(s.rest()[: s.link_count, 0].mean()) if s.kind == "quadruped" else 0.0
     ahead = np.stack([np.cos(yaw), np.sin(yaw)], -1)
     xy = root.middle - middle * root.length * ahead
     z = np.full((*yaw.shape, 1), s.root_height * root.length)
     f = lambda x: torch.as_tensor(x, dtype=torch.float32)  # noqa: E731
-    H = len(names)
+    H, T = yaw.shape
     q = torch.zeros(H, T, kin.B, 3)
     stance = torch.full((H, T, len(s.limbs)), -1.0)
-    return Guess(position=f(np.concatenate([xy, z], -1)), yaw=f(yaw), q=q, stance=stance), names
+    return Guess(position=f(np.concatenate([xy, z], -1)), yaw=f(yaw), q=q, stance=stance)
 
 
 def posture_angles(kin: Kinematics) -> tuple[Tensor, list[str]]:

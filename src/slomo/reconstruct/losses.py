@@ -98,6 +98,14 @@ def reach(s: State) -> Tensor:
     return unexplained + outside
 
 
+def misfit(s: State) -> Tensor:
+    """(H, S) of each drawn frame: its mask's pixels missed, background covered, and mask pixels far from any bone."""
+    near = silhouette.soft_min(s.sd, SOFT_PX)
+    empty, n = torch.sigmoid(near / SOFT_PX), s.inside
+    far = s.sd[:, :, :n].amin(-1).clamp(min=0) / 5.0
+    return empty[:, :, :n].mean(-1) + (1 - empty[:, :, n:]).mean(-1) + 0.5 * (far / (1 + far / 6)).mean(-1)
+
+
 def flow(s: State) -> Tensor:
     """Optical flow: the surface point that a mask pixel sees moves with its link to the next fit frame."""
     obs, K = s.obs, s.obs.K
@@ -217,6 +225,13 @@ def forward(s: State) -> Tensor:
     return (e / (1 + 0.3 * e)).mean(1)
 
 
+def facing(s: State) -> Tensor:
+    """People are filmed from the front when nothing else tells: 1 for a back seen square on, 0 for a front or side."""
+    to_camera = torch.nn.functional.normalize((s.centre - s.body.nodes[:, :, 0])[..., :2], dim=-1)
+    ahead = torch.nn.functional.normalize(s.R_root[..., :2, 0], dim=-1)
+    return (-(to_camera * ahead).sum(-1)).clamp(min=0).mean(1)
+
+
 def smooth(s: State) -> Tensor:
     """Accelerations of all nodes, and of the root twice, in units of 15 body lengths / s^2."""
     x = s.body.nodes
@@ -236,5 +251,5 @@ def prior(s: State) -> Tensor:
 
 TERMS: dict[str, Term] = {
     "mask": mask, "reach": reach, "flow": flow, "stance": stance, "ground": ground, "limits": limits, "smooth": smooth,
-    "forward": forward, "prior": prior,
+    "forward": forward, "prior": prior, "facing": facing,
 }  # fmt: skip

@@ -1,0 +1,104 @@
+"""People: the first pose of every frame, from drawn silhouettes of the skeleton itself."""
+
+import numpy as np
+import pytest
+import torch
+
+from slomo.reconstruct import hypotheses, losses, pose_track, silhouette
+from slomo.reconstruct.kinematics import Kinematics
+from slomo.reconstruct.observations import observe
+from slomo.reconstruct.problem import Problem
+from slomo.reconstruct.silhouette import Intrinsics
+from slomo.reconstruct.trajectory import Trajectory
+from slomo.skeleton import load_skeleton
+
+T, FPS, W, H = 24, 8.0, 80, 120
+K = Intrinsics(120, 120, 39.5, 59.5, W, H)
+CENTRE = np.array([0.0, -2.2, 1.0])
+TOWARDS_CAMERA = -np.pi / 2
+
+
+def _problem(yaw: np.ndarray, q: np.ndarray) -> tuple[Problem, hypotheses.RootGuess]:
+    """A person one unit high at the origin with headings yaw (T,) and joint angles q (T, B, 3), seen along y."""
+    kin = Kinematics(load_skeleton("human"))
+    f = lambda x: torch.as_tensor(x, dtype=torch.float32)  # noqa: E731
+    root = hypotheses.RootGuess(np.zeros((T, 2)), 1.0, np.zeros(T), 0.0, np.zeros(T))
+    guess = hypotheses.placed(kin, root, yaw[None])
+    R = torch.eye(3).repeat(1, T, 1, 1)
+    R[0, :, 0, 0] = R[0, :, 1, 1] = f(np.cos(yaw))
+    R[0, :, 1, 0], R[0, :, 0, 1] = f(np.sin(yaw)), -f(np.sin(yaw))
+    body = kin.pose(kin.shape_variables(1), guess.position, R, f(q)[None])
+    M = np.eye(4)
+    M[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    M[:3, 3] = CENTRE
+    Rc, centre = f(M[:3, :3].T).expand(1, T, 3, 3), f(CENTRE).expand(1, T, 3)
+    a, b = (silhouette.to_camera(Rc, centre, x) for x in (body.a, body.b))
+    v, u = torch.meshgrid(torch.arange(float(H)), torch.arange(float(W)), indexing="ij")
+    out = silhouette.outline(K, a, b, body.radii)
+    sd, _ = silhouette.distances(out, u.reshape(1, -1).expand(T, -1), v.reshape(1, -1).expand(T, -1))
+    mask = (sd[0].amin(-1) < 0).reshape(T, H, W).numpy()
+    masks = dict(packed=np.packbits(mask, axis=-1), shape=np.array(mask.shape), quality=np.ones(T))
+    flow = dict(flow=np.zeros((T - 1, H, W, 2), np.float16), consistent=np.packbits(mask[1:], axis=-1))
+    camera = dict(K=np.array([[K.fx, 0, K.cx], [0, K.fy, K.cy], [0, 0, 1]]), T_world_cam=np.tile(M, (T, 1, 1)))
+    obs = observe(np.arange(T) / FPS, masks, flow, camera, fps=8, subject_px=42)
+    path = Trajectory(obs.t, kin.B, joint_hz=2, root_hz=2, width=8)
+    return Problem(obs, kin, path, {}, 0.01), root
+
+
+def _track(problem: Problem, root: hypotheses.RootGuess, **options) -> pose_track.Track:
+    postures, _ = hypotheses.posture_angles(problem.kin)
+    start = hypotheses.placed(problem.kin, root, np.zeros((1, T)))
+    x = problem.variables(1, torch.Generator().manual_seed(0))
+    ring = tuple(2 * np.pi * n / pose_track.HEADINGS for n in range(pose_track.HEADINGS))
+    return pose_track.tracks(problem, x, start, root, postures, turns=ring, **options)[0]
+
+
+def _away(yaw: np.ndarray, true: np.ndarray | float) -> np.ndarray:
+    return np.degrees(np.abs((yaw - true + np.pi) % (2 * np.pi) - np.pi))
+
+
+@pytest.fixture(scope="module")
+def raising() -> tuple[Problem, hypotheses.RootGuess]:
+    """Arms hang, then the hands are up, then they hang again; front to the camera."""
+    kin = Kinematics(load_skeleton("human"))
+    postures, names = hypotheses.posture_angles(kin)
+    both = postures[names.index("left_arm hand_up, right_arm hand_up")].numpy()
+    q = np.zeros((T, kin.B, 3))
+    q[8:16] = both
+    return _problem(np.full(T, TOWARDS_CAMERA), q)
+
+
+def test_raised_hands_are_found_when_they_are_raised(raising):
+    track = _track(*raising)
+    shoulder = raising[0].kin.skeleton.names.index("left_shoulder")
+    raised = np.abs(track.q[:, shoulder, 0])
+    assert np.degrees(raised[10:14].min()) > 45
+    assert np.degrees(raised[[0, 1, 2, -3, -2, -1]].max()) < 30
+
+
+def test_a_person_is_seen_from_the_front_unless_asked_otherwise(raising):
+    assert _away(_track(*raising).yaw, TOWARDS_CAMERA).max() < 46
+    behind = _track(*raising, aways=(-pose_track.AWAY,))
+    assert _away(behind.yaw, -TOWARDS_CAMERA).max() < 46
+
+
+def test_a_turn_to_the_side_is_followed():
+    yaw = np.interp(np.arange(T), [8, 16], [TOWARDS_CAMERA, 0.0])
+    kin = Kinematics(load_skeleton("human"))
+    track = _track(*_problem(yaw, np.zeros((T, kin.B, 3))))
+    assert _away(track.yaw, yaw).mean() < 35
+
+
+def test_the_cheapest_path_pays_for_changes():
+    cost = np.array([[0.0, 1.0], [0.4, 0.0], [0.0, 1.0]])
+    assert pose_track.viterbi(cost, np.array([[0, 0.1], [0.1, 0]])).tolist() == [0, 1, 0]
+    assert pose_track.viterbi(cost, np.array([[0, 0.3], [0.3, 0]])).tolist() == [0, 0, 0]
+
+
+def test_only_a_back_costs(raising):
+    problem, root = raising
+    yaw = np.stack([np.full(T, TOWARDS_CAMERA + turn) for turn in (0, np.pi / 2, np.pi)])
+    x = problem.variables(3, torch.Generator().manual_seed(0))
+    draw = problem.draw(4, 20, torch.Generator().manual_seed(0))
+    state = problem.state(x, hypotheses.placed(problem.kin, root, yaw), draw, stance_weight=0.0)
+    assert losses.facing(state).tolist() == pytest.approx([0, 0, 1], abs=1e-4)
