@@ -85,11 +85,11 @@ class View:
     extent: float
 
     @classmethod
-    def of(cls, t: np.ndarray, path: np.ndarray, height: float, *, azimuth: float, extent: float) -> "View":
-        """Follow `path` (T, 3) at a constant `height` m, without its shaking."""
+    def of(cls, t: np.ndarray, path: np.ndarray, *, low: float, high: float, azimuth: float, extent: float) -> "View":
+        """Follow `path` (T, 3) without its shaking, at a constant height, so that `low` to `high` m are seen too."""
         smooth = gaussian_filter1d(path, 0.4 / float(np.median(np.diff(t))), axis=0, mode="nearest")
-        smooth[:, 2] = height
-        return cls(t, smooth, azimuth, extent)
+        smooth[:, 2] = (low + high) / 2
+        return cls(t, smooth, azimuth, max(extent, 0.9 * (high - low) * SIZE[0] / SIZE[1]))
 
     def camera(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         """K and T_world_cam at time t."""
@@ -177,9 +177,8 @@ class KeypointPanel:
             f"{i}-{j}": Part(stick.vertices, stick.faces, np.array(side_color(motion.names[j]))) for i, j in self._bones
         } | {f"{i}": Part(ball.vertices, ball.faces, np.array(side_color(n))) for i, n in enumerate(motion.names)}
         self._scene = Scene(parts, studio(size, azimuth))
-        self._view = View.of(
-            motion.t, p.mean(1), 0.5 * float(np.median(p[..., 2].max(1))), azimuth=azimuth, extent=size
-        )
+        low, high = np.percentile(p[..., 2], [1, 99])
+        self._view = View.of(motion.t, p.mean(1), low=float(low), high=float(high), azimuth=azimuth, extent=size)
 
     def draw(self, t: float) -> np.ndarray:
         t = t + self.start
@@ -192,6 +191,12 @@ class KeypointPanel:
 def robot_extent(robot: Robot) -> float:
     """m, length of the standing robot with its legs at full stride."""
     return float(np.ptp(robot.nominal_hips[:, 0])) + 1.5 * robot.standing_height
+
+
+def robot_view(t: np.ndarray, body: np.ndarray, robot: Robot, *, azimuth: float) -> View:
+    """From the ground to over the head at the body's (T, 3) highest, also where it stands on a step."""
+    high = float(np.percentile(body[:, 2], 99)) + 0.6 * robot.standing_height
+    return View.of(t, body, low=0.0, high=high, azimuth=azimuth, extent=robot_extent(robot))
 
 
 class ReferencePanel:
@@ -224,9 +229,7 @@ class ReferencePanel:
             parts[f"hip{c}"] = parts[f"foot{c}"]
             parts[f"force{c}"] = Part(arrow.vertices, arrow.faces, np.array(VERMILION), smooth=False)
         self._scene = Scene(parts | meshes.terrain_parts(terrain), studio(extent, azimuth))
-        self._view = View.of(
-            reference.t, reference.q[:, :3], 0.55 * robot.standing_height, azimuth=azimuth, extent=extent
-        )
+        self._view = robot_view(reference.t, reference.q[:, :3], robot, azimuth=azimuth)
 
     def draw(self, t: float) -> np.ndarray:
         r = self.reference
@@ -263,9 +266,7 @@ class RobotPanel:
         self._scene = Scene(parts | meshes.terrain_parts(terrain), studio(extent, azimuth))
         self._data = robot.model.createData()
         self._frames = {link: robot.model.getFrameId(link) for link in set(self._links.values())}
-        self._view = View.of(
-            rollout.t, rollout.body[:, :3], 0.55 * robot.standing_height, azimuth=azimuth, extent=extent
-        )
+        self._view = robot_view(rollout.t, rollout.body[:, :3], robot, azimuth=azimuth)
 
     def draw(self, t: float) -> np.ndarray:
         r = self.rollout
