@@ -94,7 +94,7 @@ def test_a_truncated_clip(slomo, tmp_path):
     assert "unknown segmenter 'nonsense' (valid: auto, u2netp, motion, user)" in said
     (video,) = (tmp_path / "a").glob(".slomo/store/decode/*/video.json")
     info = json.loads(video.read_text())
-    assert 8 <= info["frames_total"]
+    assert info["frames_total"] >= 8
     assert info["frames_lost"] > 10
     (tmp_path / "start.mp4").write_bytes(data[:12_000])
     said = slomo(tmp_path / "b", "reconstruct", tmp_path / "start.mp4", code=4)

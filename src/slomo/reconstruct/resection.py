@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation, Slerp
 
 from slomo.reconstruct.sfm import Structure
@@ -43,19 +44,27 @@ def _resect(points: np.ndarray, xy: np.ndarray, K: np.ndarray, guess: np.ndarray
     if len(points) < _MIN_POINTS:
         return None
     inverse = np.linalg.inv(guess)
-    turn, shift = Rotation.from_matrix(inverse[:3, :3]).as_rotvec(), inverse[:3, 3].copy()
+    turn, shift = Rotation.from_matrix(inverse[:3, :3]).as_rotvec(), inverse[:3, 3]
     cv2.setRNGSeed(0)
-    ok, turn, shift, inliers = cv2.solvePnPRansac(
-        points, xy.astype(float), K, None, turn, shift, useExtrinsicGuess=True, reprojectionError=2.0
+    ok, _, _, inliers = cv2.solvePnPRansac(
+        points, xy.astype(float), K, None, turn.copy(), shift.copy(), useExtrinsicGuess=True, reprojectionError=2.0
     )
     if not ok or inliers is None or len(inliers) < _MIN_POINTS:
         return None
     keep = np.asarray(inliers)[:, 0].astype(int)
-    turn, shift = cv2.solvePnPRefineLM(points[keep], xy[keep].astype(float), K, None, turn, shift)
+    # From the guess, not from RANSAC's pose: that one differs in its last bits from call to call.
+    start = np.concatenate([turn, shift])
+    best = least_squares(_reprojection, start, method="lm", x_scale="jac", args=(points[keep], xy[keep], K)).x
     pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_rotvec(np.ravel(turn)).as_matrix()
-    pose[:3, 3] = np.ravel(shift)
+    pose[:3, :3] = Rotation.from_rotvec(best[:3]).as_matrix()
+    pose[:3, 3] = best[3:]
     return np.linalg.inv(pose)
+
+
+def _reprojection(pose: np.ndarray, points: np.ndarray, xy: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """(2 P,) px by which points (P, 3) are seen off; `pose` is rotation vector and translation, world to camera."""
+    seen = (Rotation.from_rotvec(pose[:3]).apply(points) + pose[3:]) @ K.T
+    return (seen[:, :2] / seen[:, 2:] - xy).ravel()
 
 
 def interpolate_poses(at: np.ndarray, T_world_cam: np.ndarray, wanted: np.ndarray) -> np.ndarray:

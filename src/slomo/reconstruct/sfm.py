@@ -5,9 +5,12 @@ the work is handed over, and `python -m slomo.reconstruct.sfm DIR` is what runs 
 """
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
+import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -58,13 +61,14 @@ def reconstruct_structure(
     features: int,
     overlap: int,
     seed: int = 0,
-    threads: int = 2,
+    threads: int = 1,
 ) -> Structure | None:
     """Cameras of the frames `keys` and sparse points of what is not masked; None when COLMAP finds no model.
 
     Args:
         frames: (T, H, W, 3) uint8 RGB.  masks: (T, H, W) bool, left out.
         focal: px, start, kept when not `refine_focal`.  features: per frame.  overlap: frames matched with each.
+        threads: of COLMAP; with more than one, each run gives slightly other numbers.
 
     Raises:
         StageFailed: the process died.
@@ -104,9 +108,17 @@ def reconstruct_structure(
         return Structure(**arrays)
 
 
+def _end_with(parent: int) -> None:
+    """End this process when its parent has gone, even by SIGKILL."""
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os._exit(1)
+
+
 def _main(folder: str) -> None:
     import pycolmap
 
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     root = Path(folder)
     job = json.loads((root / "job.json").read_text())
     pycolmap.logging.minloglevel = 2

@@ -14,7 +14,7 @@ from slomo.stage import Artifact, Inputs, Progress
 
 DECODE_VERSION = 1
 MASKS_VERSION = 1
-CAMERA_VERSION = 1
+CAMERA_VERSION = 2
 
 SEGMENTERS = ("auto", "u2netp", "motion", "user")
 

@@ -146,7 +146,7 @@ class Store:
             contents: dict[str, str] = {}
             for name, arrays in artifact.npz.items():
                 write_file(build / name, lambda f, arrays=arrays: write_npz(f, arrays))
-                contents[name] = digest_arrays(arrays)
+                contents[name] = digest_arrays(without_wall_times(arrays))
             for name, data in artifact.json.items():
                 write_file(build / name, lambda f, data=data: f.write(json_bytes(data)))
                 contents[name] = digest_json(without_wall_times(plain(data)))
