@@ -12,7 +12,7 @@ import numpy as np
 
 from slomo.errors import InvalidData
 
-_WALL_TIME = re.compile(r"(^|_)(seconds|ms)(_|$)")
+_WALL_TIME = re.compile(r"(^|_)(seconds|ms)(_|$)|^missed_ticks$")
 
 
 def plain(x: Any) -> Any:
@@ -45,7 +45,7 @@ def digest_json(x: Any) -> str:
 
 
 def without_wall_times(x: Any) -> Any:
-    """`x` without the entries that measure the machine: names with the word `seconds` or `ms` (`solve_seconds`)."""
+    """`x` without the entries that measure the machine: names with the word `seconds` or `ms`, and `missed_ticks`."""
     if isinstance(x, Mapping):
         return {k: without_wall_times(v) for k, v in x.items() if not _WALL_TIME.search(k)}
     return [without_wall_times(v) for v in x] if isinstance(x, list) else x

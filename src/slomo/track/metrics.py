@@ -31,14 +31,14 @@ def errors(rollout: Rollout) -> dict[str, float | None]:
 def solver(rollout: Rollout, *, period: float) -> dict[str, Any]:
     """The controller's wall times.
 
-    `mpc_ms_p50`, `mpc_ms_p99`: ms of a solve.  `mpc_ms_missed`: solves that took longer than the period (s).
+    `mpc_ms_p50`, `mpc_ms_p99`: ms of a solve.  `missed_ticks`: solves that took longer than the period (s).
     `mpc_kept_plans`: ticks at which the solver failed and the previous plan was kept.
     """
     ms = rollout.mpc_ms
     return {
         "mpc_ms_p50": float(np.percentile(ms, 50)),
         "mpc_ms_p99": float(np.percentile(ms, 99)),
-        "mpc_ms_missed": int(np.sum(ms > 1e3 * period)),
+        "missed_ticks": int(np.sum(ms > 1e3 * period)),
         "mpc_kept_plans": int(np.sum(rollout.mpc_status != 0)),
     }
 
