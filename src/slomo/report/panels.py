@@ -194,9 +194,10 @@ def robot_extent(robot: Robot) -> float:
 
 
 def robot_view(t: np.ndarray, body: np.ndarray, robot: Robot, *, azimuth: float) -> View:
-    """From the ground to over the head at the body's (T, 3) highest, also where it stands on a step."""
+    """From the near feet to over the head at the body's (T, 3) highest, also where it stands on a step."""
     high = float(np.percentile(body[:, 2], 99)) + 0.6 * robot.standing_height
-    return View.of(t, body, low=0.0, high=high, azimuth=azimuth, extent=robot_extent(robot))
+    # Seen from above, feet nearer than the body lie lower in the picture than the ground under it.
+    return View.of(t, body, low=-0.3 * robot.standing_height, high=high, azimuth=azimuth, extent=robot_extent(robot))
 
 
 class ReferencePanel:

@@ -17,7 +17,7 @@ from slomo.stage import Arrays, Artifact, Inputs, Progress
 from slomo.synth.score import score
 from slomo.terrain import Terrain
 
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True)
