@@ -24,7 +24,9 @@ PIXELS = 160
 HEADINGS = 12
 AWAY = 0.08  # cost of a back seen square on: people are filmed from the front unless something says otherwise
 TRAVEL = 0.25  # cost of moving backwards at a walk
-TURN = 0.04  # cost of a turn by one step of heading between two scored frames, and of each further step
+# Cost of a turn by one step of heading between two scored frames. High: an oblique view and its mirror image
+# look alike, and a person who stands while the camera goes around must not be turned along with it.
+TURN = 0.15
 CHANGE = 0.05  # cost of a change of all joints' angles by 90 degrees in sum
 
 
