@@ -19,7 +19,7 @@ from slomo.retarget.trunk import Trunk, trunk_frame
 from slomo.robot import Robot
 from slomo.stage import Artifact, Inputs, Progress
 
-VERSION = 3
+VERSION = 4
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ _MAX_LEVEL = 0.35  # rad, key points misplaced by more than this are a posture, 
 _MAX_TILT = 0.6  # rad, roll and pitch that a legged robot can follow
 _CLEARANCE = 0.10  # of the standing height: a foot lifted more than this swings
 _SHORTEST = 0.08  # s, shorter stances and swings are noise
-_CREEP = 0.2  # of the standing height: a standing foot that creeps further takes a step
+_CREEP = 0.25  # of the standing height: a standing foot that creeps further takes a step
 _MARGIN = 0.15  # s, left out beside an impossible turn
 _STEP = 0.24  # s, duration of such a step
 
