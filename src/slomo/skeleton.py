@@ -61,6 +61,7 @@ class Skeleton:
         lower, upper, sigma: (B, 3) rad about x, y, z; the root's row is free.
         capsule_names, capsule_link (C,), capsule_nodes (C, 2), capsule_shift (C, 2, 3), capsule_radii (C, 2),
             capsule_mirror (C,): the body's volume, rounded cones between two nodes of a link, body lengths.
+        part_names, capsule_part (C,): what a picture of the body is segmented into, and the part of each capsule.
         postures: sets of alternatives; of each set the rest or one may hold.
         sole: height of a contact node above the ground in stance, body lengths.
     """
@@ -86,6 +87,8 @@ class Skeleton:
     capsule_shift: Array
     capsule_radii: Array
     capsule_mirror: Array
+    part_names: tuple[str, ...]
+    capsule_part: Array
     limbs: tuple[Limb, ...]
     gaits: tuple[Gait, ...]
     sole: float
@@ -179,6 +182,10 @@ def _flip_capsule(entry: Mapping[str, Any]) -> dict[str, Any]:
     return dict(entry, link=_flip(entry["link"]), **{k: _flip(entry[k]) for k in ("from", "to")}, shift=shift)
 
 
+def _flip_part(entry: list[str]) -> list[str]:
+    return [_flip(c) for c in entry]
+
+
 def _flip_limb(entry: Mapping[str, Any]) -> dict[str, Any]:
     return dict(
         contact=_flip(entry["contact"]),
@@ -196,6 +203,7 @@ def _build(d: Mapping[str, Any], where: str) -> Skeleton:
     points = _mirrored(d["points"], _flip_node)
     capsules = _mirrored(d["capsules"], _flip_capsule)
     limbs = _mirrored(d["limbs"], _flip_limb)
+    parts = _mirrored(d.get("parts") or {c: [c] for c in d["capsules"]}, _flip_part)
     links = [d["root"], *joints]
     names = [*links, *points]
     nodes = {**joints, **points}
@@ -223,6 +231,11 @@ def _build(d: Mapping[str, Any], where: str) -> Skeleton:
         if any(m != own and link[m] != own for m in pair):
             raise InvalidData(f"capsule {c!r}: its ends must be nodes of its link", where=where)
 
+    part_of = {c: n for n, members in enumerate(parts.values()) for c in members}
+    for c in (*part_of, *capsules):
+        if c not in part_of or c not in capsules:
+            raise InvalidData(f"capsule {c!r} must be in [capsules] and in one of [parts]", where=where)
+
     def mirror_of(items: list[str], name: str) -> int:
         other = _flip(name)
         return items.index(other) if other in items else items.index(name)
@@ -249,6 +262,8 @@ def _build(d: Mapping[str, Any], where: str) -> Skeleton:
         capsule_shift=np.array([e.get("shift", np.zeros((2, 3))) for e in capsules.values()], float),
         capsule_radii=np.array([e["radii"] for e in capsules.values()], float),
         capsule_mirror=np.array([mirror_of(list(capsules), c) for c in capsules]),
+        part_names=tuple(parts),
+        capsule_part=np.array([part_of[c] for c in capsules]),
         limbs=tuple(
             Limb(
                 name,
