@@ -6,6 +6,7 @@ metres, z up. Cameras: OpenCV convention, pixel centres at integer coordinates.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -68,16 +69,31 @@ class Image:
         ids: (H, W, S) part id, 0 = ground, -1 = sky.
         depth: (H, W, S) m along the optical axis, inf in the sky.
         points: (H, W, S, 3) m, world point that the ray hit (arbitrary in the sky).
+        faces: (H, W, S) triangle that was hit, counted from the first of the first part; -1 for none.
+        weights: (H, W, S, 3) barycentric weights of the triangle's corners there.
     """
 
     rgb: np.ndarray
     ids: np.ndarray
     depth: np.ndarray = field(repr=False)
     points: np.ndarray = field(repr=False)
+    faces: np.ndarray = field(repr=False)
+    weights: np.ndarray = field(repr=False)
 
     def mask(self, id: int) -> np.ndarray:
         """(H, W) bool: at least half of the pixel's samples see part `id`."""
         return (self.ids == id).mean(-1) >= 0.5
+
+
+class _Hits(NamedTuple):
+    """Linear colour (n, 3), id, depth, point (n, 3), face and barycentric u, v (n, 2) of n rays."""
+
+    rgb: np.ndarray
+    ids: np.ndarray
+    depth: np.ndarray
+    points: np.ndarray
+    faces: np.ndarray
+    uv: np.ndarray
 
 
 def _linear(srgb) -> np.ndarray:
@@ -143,6 +159,12 @@ class Scene:
         self._light.zenith, self._light.horizon = wp.vec3(*_linear(light.zenith)), wp.vec3(*_linear(light.horizon))
         self._light.hills, self._light.fog = light.hills, light.fog
 
+    def corners(self, name: str) -> tuple[int, np.ndarray]:
+        """The number of a part's first triangle in `Image.faces`, and its triangles' corners (F, 3) in its vertices."""
+        vertices = self._slices[name]
+        mine = (self._faces[:, 0] >= vertices.start) & (self._faces[:, 0] < vertices.stop)
+        return int(np.flatnonzero(mine)[0]), self._faces[mine] - vertices.start
+
     def _build(self) -> None:
         with wp.ScopedDevice(self.device):
             self._mesh = wp.Mesh(wp.array(self._world, dtype=wp.vec3), self._indices)
@@ -172,16 +194,20 @@ class Scene:
     def render(self, K: np.ndarray, T_world_cam: np.ndarray, size: Sequence[int], *, supersample: int = 1) -> Image:
         """Cast supersample^2 rays a pixel. Args: K (3, 3) px; T_world_cam (4, 4); size (width, height) px."""
         width, height = size
-        rgb, ids, depth, points = self._cast(K, T_world_cam, width, np.arange(width * height), supersample)
+        hits = self._cast(K, T_world_cam, width, np.arange(width * height), supersample)
         shape = (height, width, supersample**2)
-        rgb = _display(rgb.reshape(*shape, 3).mean(2))
-        return Image(rgb, ids.reshape(shape), depth.reshape(shape), points.reshape(*shape, 3))
+        rgb = _display(hits.rgb.reshape(*shape, 3).mean(2))
+        weights = np.concatenate([hits.uv, 1 - hits.uv.sum(1, keepdims=True)], 1).reshape(*shape, 3)
+        points = hits.points.reshape(*shape, 3)
+        return Image(
+            rgb, *(x.reshape(shape) for x in (hits.ids, hits.depth)), points, hits.faces.reshape(shape), weights
+        )
 
     def picture(self, K: np.ndarray, T_world_cam: np.ndarray, size: Sequence[int]) -> np.ndarray:
         """(H, W, 3) uint8 RGB for the eye: one ray a pixel, four where the picture has an edge. Args as `render`."""
         width, height = size
-        rgb, ids, _, _ = self._cast(K, T_world_cam, width, np.arange(width * height), 1)
-        rgb, ids = rgb.reshape(height, width, 3), ids.reshape(height, width)
+        hits = self._cast(K, T_world_cam, width, np.arange(width * height), 1)
+        rgb, ids = hits.rgb.reshape(height, width, 3), hits.ids.reshape(height, width)
         shade = np.clip(rgb, 0, 1).mean(-1) ** (1 / 2.2)
         edge = np.zeros((height, width), bool)
         for axis in (0, 1):
@@ -191,17 +217,16 @@ class Scene:
                 edge |= np.pad(step, grow)
         again = np.flatnonzero(edge)
         if len(again):
-            rgb[edge] = self._cast(K, T_world_cam, width, again, 2)[0].reshape(-1, 4, 3).mean(1)
+            rgb[edge] = self._cast(K, T_world_cam, width, again, 2).rgb.reshape(-1, 4, 3).mean(1)
         return _display(rgb)
 
-    def _cast(
-        self, K: np.ndarray, T_world_cam: np.ndarray, width: int, pixels: np.ndarray, side: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Linear colour (n, 3), id (n,), depth (n,) and point (n, 3) of side^2 samples of each of the pixels."""
+    def _cast(self, K: np.ndarray, T_world_cam: np.ndarray, width: int, pixels: np.ndarray, side: int) -> "_Hits":
+        """side^2 samples of each of the pixels."""
         n = len(pixels) * side**2
         with wp.ScopedDevice(self.device):
             rgb, points = (wp.empty(n, dtype=wp.vec3) for _ in range(2))  # pyright: ignore[reportArgumentType]
             ids, depth = wp.empty(n, dtype=int), wp.empty(n, dtype=float)
+            faces, uv = wp.empty(n, dtype=int), wp.zeros(n, dtype=wp.vec2)  # pyright: ignore[reportArgumentType]
             wp.launch(
                 cast,
                 dim=n,
@@ -209,9 +234,9 @@ class Scene:
                 + [wp.mat33(T_world_cam[:3, :3].ravel()), wp.vec3(*T_world_cam[:3, 3])]
                 + [wp.vec2(K[0, 0], K[1, 1]), wp.vec2(K[0, 2], K[1, 2]), width]
                 + [wp.array(pixels.astype(np.int32), dtype=int), side, self._light],
-                outputs=[rgb, ids, depth, points],
+                outputs=[rgb, ids, depth, points, faces, uv],
             )
-        return rgb.numpy(), ids.numpy(), depth.numpy(), points.numpy()
+        return _Hits(*(x.numpy() for x in (rgb, ids, depth, points, faces, uv)))
 
 
 def _display(linear: np.ndarray) -> np.ndarray:

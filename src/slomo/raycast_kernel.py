@@ -147,6 +147,8 @@ def cast(
     ids: wp.array(dtype=int),
     depth: wp.array(dtype=float),
     points: wp.array(dtype=wp.vec3),
+    faces: wp.array(dtype=int),
+    uv: wp.array(dtype=wp.vec2),
 ):
     """Sample n % side^2 of pixel `pixels[n // side^2]`: samples lie on a side x side grid over the pixel."""
     n = wp.tid()
@@ -163,8 +165,11 @@ def cast(
     albedo = wp.vec3(0.0, 0.0, 0.0)
     normal = wp.vec3(0.0, 0.0, 1.0)
     q = wp.mesh_query_ray(mesh, origin, d, t)
+    faces[n] = -1
     if q.result:
         t = q.t
+        faces[n] = q.face
+        uv[n] = wp.vec2(q.u, q.v)
         id = face_id[q.face]
         a, b, c = wp.mesh_get_index(mesh, 3 * q.face), wp.mesh_get_index(mesh, 3 * q.face + 1), 0
         c = wp.mesh_get_index(mesh, 3 * q.face + 2)

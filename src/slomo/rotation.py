@@ -46,3 +46,13 @@ def rot_z(angle: Array | float) -> Array:
     c, s = np.cos(angle), np.sin(angle)
     zero, one = np.zeros_like(c), np.ones_like(c)
     return np.stack([np.stack([c, -s, zero], -1), np.stack([s, c, zero], -1), np.stack([zero, zero, one], -1)], -2)
+
+
+def rot_zyx(yaw: Array, pitch: Array, roll: Array) -> Array:
+    """(..., 3, 3) Rz(yaw) Ry(pitch) Rx(roll), rad; positive pitch turns the x axis down."""
+    c, s = np.cos, np.sin
+    zero, one = np.zeros_like(yaw), np.ones_like(yaw)
+    Ry = [[c(pitch), zero, s(pitch)], [zero, one, zero], [-s(pitch), zero, c(pitch)]]
+    Rx = [[one, zero, zero], [zero, c(roll), -s(roll)], [zero, s(roll), c(roll)]]
+    y, x = (np.stack([np.stack(row, -1) for row in R], -2) for R in (Ry, Rx))
+    return rot_z(yaw) @ y @ x

@@ -71,6 +71,31 @@ def add_commands(app: typer.Typer) -> None:
         path = download_weights()
         session.emit(str(path), {"path": str(path)})
 
+    @command(app, "dataset")
+    def dataset(
+        session: Session,
+        out_dir: Annotated[Path, typer.Argument(help="Folder; the shards go into one for the kind below it.")],
+        kind: Annotated[str | None, typer.Option(metavar="quadruped|human", help="Default: quadruped.")] = None,
+        samples: Annotated[int | None, typer.Option(help="How many pictures. Default: 6400.")] = None,
+        seed: Annotated[int | None, typer.Option(help="Of everything in it.")] = None,
+        workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    ) -> None:
+        """Labelled pictures of random animals or people, to train the prior on. Goes on where it was stopped.
+
+        \b
+        slomo dataset data --kind human --samples 640 --workers 2
+        """
+        from slomo import settings
+        from slomo.store import writing
+        from slomo.synth.dataset import Config, write_dataset
+
+        given: dict[str, Any] = dict(kind=kind, samples=samples, seed=seed)
+        config = settings.make(Config, {k: v for k, v in given.items() if v is not None}, where="dataset")
+        session.console.start("dataset")
+        with writing(out_dir):
+            path = write_dataset(out_dir, config, _Shown(session.console), workers=workers)
+        session.emit(str(path.absolute()), {"path": str(path.absolute()), "config": vars(config)})
+
     @command(app, "synth")
     def synth(
         session: Session,

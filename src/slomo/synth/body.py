@@ -3,35 +3,18 @@
 from dataclasses import dataclass
 
 import numpy as np
-import warp as wp
-from warp.geometry import IsoSurfaceMarchingCubes
 
 from slomo.synth.animal import BONES, KEYPOINTS, Proportions, rest_joints
+from slomo.synth.flesh import Cone, mesh, value_noise
 
 
-@dataclass(frozen=True)
-class _Cone:
-    """A capsule with two radii (m) that bone `bone` carries."""
-
-    bone: int
-    a: np.ndarray
-    b: np.ndarray
-    ra: float
-    rb: float
-
-    def distance(self, x: np.ndarray) -> np.ndarray:
-        d = self.b - self.a
-        s = np.clip((x - self.a) @ d / (d @ d), 0, 1)
-        return np.linalg.norm(x - self.a - s[..., None] * d, axis=-1) - (self.ra + s * (self.rb - self.ra))
-
-
-def _flesh(p: Proportions, j: dict[str, np.ndarray]) -> list[_Cone]:
+def _flesh(p: Proportions, j: dict[str, np.ndarray]) -> list[Cone]:
     h, g, r = p.height, p.girth, p.limb
     bone = {b: i for i, b in enumerate(BONES)}
-    out: list[_Cone] = []
+    out: list[Cone] = []
 
     def add(name: tuple[str, str], a, b, ra: float, rb: float) -> None:
-        out.append(_Cone(bone[name], np.asarray(a, float), np.asarray(b, float) + 1e-6, ra * h, rb * h))
+        out.append(Cone(bone[name], np.asarray(a, float), np.asarray(b, float) + 1e-6, ra * h, rb * h))
 
     def at(name: str, x: float = 0, y: float = 0, z: float = 0) -> np.ndarray:
         return j[name] + h * np.array([x, y, z])
@@ -112,19 +95,6 @@ def bone_frames(keypoints: np.ndarray, lateral: np.ndarray) -> np.ndarray:
     return T
 
 
-def _value_noise(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(V,) smooth noise in [0, 1], cell 1, from points (V, 3)."""
-    table = rng.random((32, 32, 32))
-    i = np.floor(x).astype(int)
-    f = x - i
-    f = f * f * (3 - 2 * f)
-    out = np.zeros(len(x))
-    for c in np.ndindex(2, 2, 2):
-        w = np.prod(np.where(c, f, 1 - f), axis=1)
-        out += w * table[tuple(((i + c) % 32).T)]
-    return out
-
-
 _COATS = {
     "dog": [
         ((0.20, 0.17, 0.15), (0.72, 0.50, 0.30), (0.92, 0.90, 0.86)),
@@ -145,16 +115,16 @@ def _coat(animal: str, p: Proportions, v: np.ndarray, j: dict[str, np.ndarray], 
     """(V, 3) sRGB: a base, a lighter belly and lower legs, patches or stripes, dark nose, eyes and toes."""
     base, light, patch = (np.array(c) for c in _COATS[animal][rng.integers(2)])
     x = v / p.height
-    n = _value_noise(x * 6 + 9, rng) * 0.65 + _value_noise(x * 15 + 3, rng) * 0.35
+    n = value_noise(x * 6 + 9, rng) * 0.65 + value_noise(x * 15 + 3, rng) * 0.35
     below = np.clip((0.60 - x[:, 2] + 0.25 * (n - 0.5)) / 0.14, 0, 1)[:, None]
     color = base * (1 - below) + light * below
     if animal == "cat":
-        wave = np.sin(34 * x[:, 0] + 9 * (_value_noise(x * 5, rng) - 0.5) + 6 * x[:, 2])
+        wave = np.sin(34 * x[:, 0] + 9 * (value_noise(x * 5, rng) - 0.5) + 6 * x[:, 2])
         spots = np.clip(3 * wave - 0.6, 0, 1) * np.clip((x[:, 2] - 0.2) / 0.2, 0, 1)
     else:
         spots = np.clip((n - 0.56) / 0.03, 0, 1)
     color = color * (1 - spots[:, None]) + patch * spots[:, None]
-    color *= (0.82 + 0.36 * _value_noise(x * 40, rng))[:, None]
+    color *= (0.82 + 0.36 * value_noise(x * 40, rng))[:, None]
 
     def paint(centre: np.ndarray, radius: float, rgb: tuple[float, float, float]) -> None:
         s = np.clip((radius - np.linalg.norm(x - centre / p.height, axis=1)) / 0.012 + 0.5, 0, 1)[:, None]
@@ -174,23 +144,7 @@ def build_body(animal: str, p: Proportions, seed: int) -> Body:
     """Mesh the smooth union of the flesh (marching cubes), skin it to the bones and colour it."""
     joints = rest_joints(p)
     cones = _flesh(p, joints)
-    cell, blend = 0.0145 * p.height, 0.016 * p.height
-    ends = np.stack([e for c in cones for e in (c.a, c.b)])
-    lower, upper = ends.min(0) - 0.24 * p.height, ends.max(0) + 0.24 * p.height
-    shape = np.ceil((upper - lower) / cell).astype(int) + 1
-    grid = lower + cell * np.stack(np.meshgrid(*(np.arange(s) for s in shape), indexing="ij"), -1)
-    total = np.zeros(tuple(shape))
-    for c in cones:
-        total += np.exp(np.clip(-c.distance(grid) / blend, -60, 60))
-    field = wp.array((-blend * np.log(total + 1e-20)).astype(np.float32), dtype=float, device="cpu")
-    bounds = [wp.vec3(*lower), wp.vec3(*(lower + cell * (shape - 1)))]
-    verts, faces = IsoSurfaceMarchingCubes.extract(
-        field,  # pyright: ignore[reportArgumentType]
-        0.0,
-        lower=bounds[0],
-        upper=bounds[1],
-    )
-    v, f = verts.numpy().astype(float), faces.numpy().reshape(-1, 3)
+    v, f = mesh(cones, cell=0.0145 * p.height, blend=0.016 * p.height)
     near = np.full((len(v), len(BONES)), np.inf)
     for c in cones:
         near[:, c.bone] = np.minimum(near[:, c.bone], c.distance(v))

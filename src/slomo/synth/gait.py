@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slomo.rotation import rot_zyx
 from slomo.synth.animal import FEET, KEYPOINTS, LEG_JOINTS, Proportions, rest_joints
 
 G = 9.81
@@ -104,20 +105,6 @@ def _feet(gait: Gait, rate: float, t: np.ndarray, path: _Path, rest: dict[str, n
     return paws, contact, phase
 
 
-def _rotation(yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
-    """(T, 3, 3) Rz Ry Rx, rad."""
-    c, s = np.cos, np.sin
-    z, o = np.zeros_like(yaw), np.ones_like(yaw)
-
-    def stack(rows) -> np.ndarray:
-        return np.stack([np.stack(r, -1) for r in rows], -2)
-
-    Rz = stack([[c(yaw), -s(yaw), z], [s(yaw), c(yaw), z], [z, z, o]])
-    Ry = stack([[c(pitch), z, s(pitch)], [z, o, z], [-s(pitch), z, c(pitch)]])
-    Rx = stack([[o, z, z], [z, c(roll), -s(roll)], [z, s(roll), c(roll)]])
-    return Rz @ Ry @ Rx
-
-
 def animate(p: Proportions, gait_name: str, t: np.ndarray, *, speed: float | None, turn: float, seed: int) -> Motion:
     """Move the animal along a path through the origin.
 
@@ -147,14 +134,14 @@ def animate(p: Proportions, gait_name: str, t: np.ndarray, *, speed: float | Non
 
     def pose(drop: float) -> dict[str, np.ndarray]:
         """Trunk joints (T, 3), and shoulders and hips, with the trunk lowered by `drop` m."""
-        R = _rotation(yaw, pitch, roll)
-        fore = R @ _rotation(bend / 2, 0 * t, 0 * t)  # rear and fore halves bend about the middle of the spine
-        aft = R @ _rotation(-bend / 2, 0 * t, 0 * t)
+        R = rot_zyx(yaw, pitch, roll)
+        fore = R @ rot_zyx(bend / 2, 0 * t, 0 * t)  # rear and fore halves bend about the middle of the spine
+        aft = R @ rot_zyx(-bend / 2, 0 * t, 0 * t)
         middle = rest["spine_mid"]
         centre = np.concatenate([path.at(t, middle[0] * one, 0 * one), (middle[2] - drop + bob)[:, None]], 1)
         nod = 0.05 * moving * np.sin(2 * beat + 0.4) + 0.09 * slow[:, 3]
-        look = fore @ _rotation(0.5 * bend + 0.18 * slow[:, 4], nod, 0 * t)
-        wag = aft @ _rotation(0.30 * slow[:, 5] + 0.12 * np.sin(beat), 0.15 * slow[:, 6], 0 * t)
+        look = fore @ rot_zyx(0.5 * bend + 0.18 * slow[:, 4], nod, 0 * t)
+        wag = aft @ rot_zyx(0.30 * slow[:, 5] + 0.12 * np.sin(beat), 0.15 * slow[:, 6], 0 * t)
         out: dict[str, np.ndarray] = {"spine_mid": centre}
 
         def hang(name: str, parent: str, R: np.ndarray) -> None:
@@ -166,7 +153,7 @@ def animate(p: Proportions, gait_name: str, t: np.ndarray, *, speed: float | Non
         hang("tail_tip", "tail_base", wag)
         hang("neck", "withers", look)
         hang("head", "neck", look)
-        hang("nose", "head", look @ _rotation(0.15 * slow[:, 4], 0.05 * slow[:, 7], 0 * t))
+        hang("nose", "head", look @ rot_zyx(0.15 * slow[:, 4], 0.05 * slow[:, 7], 0 * t))
         for side in ("left", "right"):
             hang(f"front_{side}_shoulder", "withers", fore)
             hang(f"hind_{side}_hip", "pelvis", aft)
