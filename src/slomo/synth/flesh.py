@@ -66,8 +66,10 @@ def value_noise(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     i = np.floor(x).astype(int)
     f = x - i
     f = f * f * (3 - 2 * f)
+    near, far = i % 32, (i + 1) % 32
+    weight, place = [1 - f, f], [near, far]
     out = np.zeros(len(x))
-    for c in np.ndindex(2, 2, 2):
-        w = np.prod(np.where(c, f, 1 - f), axis=1)
-        out += w * table[tuple(((i + c) % 32).T)]
+    for a, b, c in np.ndindex(2, 2, 2):
+        w = weight[a][:, 0] * weight[b][:, 1] * weight[c][:, 2]
+        out += w * table[place[a][:, 0], place[b][:, 1], place[c][:, 2]]
     return out
