@@ -78,7 +78,7 @@ def test_raised_hands_are_found_when_they_are_raised(raising):
 
 def test_a_person_is_seen_from_the_front_unless_asked_otherwise(raising):
     assert _away(_track(*raising).yaw, TOWARDS_CAMERA).max() < 46
-    behind = _track(*raising, aways=(-pose_track.AWAY,))
+    behind = _track(*raising, views=(-pose_track.AWAY,))
     assert _away(behind.yaw, -TOWARDS_CAMERA).max() < 46
 
 

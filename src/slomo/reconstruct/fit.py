@@ -96,9 +96,10 @@ def _start(problem: Problem, root: RootGuess, generator: torch.Generator) -> Run
     tried: list[tuple[Tensor, list[Guess], list[dict]]] = []
     sizes = (1.0, 0.8)
     one = problem.variables(1, generator)
+    said = hypotheses.said_headings(problem.obs, problem.said, root)
     for size in sizes:
         scaled = replace(root, length=root.length * size)
-        guess, names = hypotheses.heading_guess(problem.kin, scaled, len(problem.obs.t))
+        guess, names = hypotheses.heading_guess(problem.kin, scaled, len(problem.obs.t), said)
         x = _pick(one, torch.zeros(n, dtype=torch.long))
         x["shape.log_length"] += math.log(scaled.length)
         values, guesses, labels = [], [], []
@@ -118,7 +119,7 @@ def _start(problem: Problem, root: RootGuess, generator: torch.Generator) -> Run
 
 def _start_tracked(problem: Problem, root: RootGuess, generator: torch.Generator) -> Run:
     """Paths through headings and postures that suit the silhouettes best, mostly seen from the front and from behind,
-    and one that faces the way of travel; each with two sizes."""
+    one as the view is said to be, and one that faces the way of travel; each with two sizes."""
     postures, posture_names = hypotheses.posture_angles(problem.kin)
     one = problem.variables(1, generator)
     T, ring = len(problem.obs.t), tuple(2 * math.pi * n / pose_track.HEADINGS for n in range(pose_track.HEADINGS))
@@ -128,9 +129,11 @@ def _start_tracked(problem: Problem, root: RootGuess, generator: torch.Generator
         x = _pick(one, torch.zeros(1, dtype=torch.long))
         x["shape.log_length"] += math.log(scaled.length)
         any_way = hypotheses.placed(problem.kin, scaled, np.zeros((1, T)))
-        aways = (pose_track.AWAY, -pose_track.AWAY)
-        found = pose_track.tracks(problem, x, any_way, scaled, postures, turns=ring, aways=aways)
-        kinds = ["front", "back"]
+        views: dict[str, pose_track.View] = {"front": pose_track.AWAY, "back": -pose_track.AWAY}
+        if problem.said and "view" in problem.said.groups:
+            views["view"] = problem.said
+        found = pose_track.tracks(problem, x, any_way, scaled, postures, turns=ring, views=tuple(views.values()))
+        kinds = list(views)
         if root.travelled > 0.7:
             travel = hypotheses.placed(problem.kin, scaled, root.heading[None])
             found += pose_track.tracks(problem, x, travel, scaled, postures)

@@ -10,8 +10,9 @@ import numpy as np
 import torch
 
 from slomo.errors import UsageError
+from slomo.reconstruct import evidence_terms, hypotheses, losses
 from slomo.reconstruct import fit as fitting
-from slomo.reconstruct import hypotheses
+from slomo.reconstruct.evidence import Evidence, gather
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.observations import Observations, observe
 from slomo.reconstruct.outcome import Outcome, assess
@@ -20,7 +21,7 @@ from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import Skeleton, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 2
+FIT_VERSION = 3
 
 # The rest pose at the right place overlaps by 0.5 to 0.6, a fit that is right by 0.75 and more. Below this the body is
 # elsewhere or another shape in many frames, and its key points do not follow the subject.
@@ -40,7 +41,8 @@ class FitConfig:
         iterations: of the heading, gait, rivals and final phase.
         candidates: hypotheses that are fitted in the gait phase; gait_phases: phases tried of each gait.
         tilt_moving_deg, tilt_static_deg: s.d. of the given gravity for a camera that moved, and for one that did not.
-        weight_*: of the evidence; 0 switches a term off. `facing` is for people only.
+        weight_*: of the evidence; 0 switches a term off. `facing` is for people only; `view`, `keypoints`, `parts` and
+            `surface` are what networks and the user say, where they say anything.
     """
 
     skeleton: str = "quadruped"
@@ -66,6 +68,10 @@ class FitConfig:
     weight_forward: float = 0.25
     weight_prior: float = 0.05
     weight_facing: float = 0.05
+    weight_view: float = 0.05
+    weight_keypoints: float = 0.1
+    weight_parts: float = 0.1
+    weight_surface: float = 0.1
 
     def __post_init__(self):
         if self.length_m < 0:
@@ -80,8 +86,8 @@ class FitConfig:
 def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
     """Fit the skeleton to masks and flow.
 
-    Reads the artifacts "decode" (frames.npz: t), "masks" (masks.npz, flow.npz) and "camera" (camera.npz, report.json),
-    and the file "skeleton" where the user gave one.
+    Reads the artifacts "decode" (frames.npz: t), "masks" (masks.npz, flow.npz), "camera" (camera.npz, report.json) and,
+    where there is one, "evidence" (evidence.npz), and the file "skeleton" where the user gave one.
 
     Returns:
         keypoints.npz and report.json; `failure` is set when the body hardly overlaps the masks.
@@ -99,9 +105,11 @@ def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
     path = Trajectory(obs.t, kin.B, joint_hz=config.joint_hz, root_hz=config.root_hz, width=config.width)
     spread = np.radians(config.tilt_moving_deg if mode == "moving" else config.tilt_static_deg)
     weights = config.weights()
-    if skeleton.kind != "human":
+    said = _evidence(inputs, obs, skeleton, weights)
+    if skeleton.kind != "human" or (said and "view" in said.groups):
         weights["facing"] = 0.0
-    problem = Problem(obs, kin, path, weights, float(spread))
+    terms = {**losses.TERMS, **(evidence_terms.terms(said) if said else {})}
+    problem = Problem(obs, kin, path, weights, float(spread), terms, said)
     root = hypotheses.root_guess(obs, skeleton)
     metres = config.length_m or skeleton.typical_length
     with _one_thread():
@@ -111,6 +119,7 @@ def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
     progress.note(f"size: {metres:g} m from {source}; the video alone does not tell it")
     report: dict[str, Any] = outcome.report | {
         "skeleton": skeleton.name, "camera_mode": mode, "length_m": metres, "scale_source": source,
+        "evidence": list(said.groups) if said else [],
         "seconds": round(time.perf_counter() - began, 1), "cpu_seconds": round(time.process_time() - cpu, 1),
     }  # fmt: skip
     arrays = _arrays(obs, skeleton, outcome, masks.npz["masks.npz"], camera.npz["camera.npz"]["K"])
@@ -119,6 +128,15 @@ def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
     if iou < MIN_IOU:
         failure = f"the fitted body covers the subject badly (IoU {iou:.2f}, needs {MIN_IOU}); look at the masks"
     return Artifact(npz={"keypoints.npz": arrays}, json={"report.json": report}, failure=failure)
+
+
+def _evidence(inputs: Inputs, obs: Observations, skeleton: Skeleton, weights: dict[str, float]) -> Evidence | None:
+    """What is said about the clip less what is switched off; None when nothing is left."""
+    if "evidence" not in inputs.artifacts:
+        return None
+    said = gather(inputs.artifacts["evidence"].npz["evidence.npz"], obs, skeleton)
+    said = said.without([g for g in said.groups if not weights[g]])
+    return said if said.groups else None
 
 
 @contextlib.contextmanager

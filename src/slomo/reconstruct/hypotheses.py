@@ -2,11 +2,13 @@
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from slomo.reconstruct.evidence import Evidence
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.observations import Observations, ground_points
 from slomo.reconstruct.trajectory import Guess
@@ -98,9 +100,20 @@ def root_guess(obs: Observations, skeleton: Skeleton) -> RootGuess:
     return RootGuess(full, length, heading, travelled, speed / length)
 
 
-def heading_guess(kin: Kinematics, root: RootGuess, T: int) -> tuple[Guess, list[str]]:
-    """Rest poses along the path: facing the way of travel, and facing eight fixed ways."""
-    yaws, names = [], []
+def said_headings(obs: Observations, said: Evidence | None, root: RootGuess) -> list[tuple[str, Array]]:
+    """Headings (T,) rad in which the view decided for the clip is seen, and its likely mirror images; none unsaid."""
+    t, at = obs.t.numpy(), obs.at.numpy()
+    to_camera = obs.T_world_cam[at, :2, 3] - root.middle[at]
+    to_camera = np.unwrap(np.arctan2(to_camera[:, 1], to_camera[:, 0]))
+    paths = said.paths() if said else []
+    return [(name, np.interp(t, t[at], np.unwrap(to_camera - azimuth))) for name, azimuth in paths]
+
+
+def heading_guess(
+    kin: Kinematics, root: RootGuess, T: int, said: Sequence[tuple[str, Array]] = ()
+) -> tuple[Guess, list[str]]:
+    """Rest poses along the path: facing as they are `said` to, the way of travel, and eight fixed ways."""
+    yaws, names = [yaw for _, yaw in said], [f"view, {name}" for name, _ in said]
     if root.travelled > 0.7:
         for turn in (0.0, -30.0, 30.0, 180.0):
             yaws.append(root.heading + math.radians(turn))

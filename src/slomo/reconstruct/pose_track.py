@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from slomo.reconstruct import losses
+from slomo.reconstruct import evidence_terms, losses
+from slomo.reconstruct.evidence import Evidence
 from slomo.reconstruct.hypotheses import RootGuess
 from slomo.reconstruct.problem import Draw, Problem, Variables
 from slomo.reconstruct.trajectory import Guess
@@ -27,7 +28,10 @@ TRAVEL = 0.25  # cost of moving backwards at a walk
 # Cost of a turn by one step of heading between two scored frames. High: an oblique view and its mirror image
 # look alike, and a person who stands while the camera goes around must not be turned along with it.
 TURN = 0.15
+SAID = 0.15  # cost of a heading that is 3 nats less likely by the view's evidence than the likeliest
 CHANGE = 0.05  # cost of a change of all joints' angles by 90 degrees in sum
+
+View = float | Evidence
 
 
 @dataclass(frozen=True)
@@ -64,15 +68,15 @@ def viterbi(cost: Array, step: Array) -> Array:
 
 def tracks(
     problem: Problem, x: Variables, guess: Guess, root: RootGuess, postures: Tensor, *,
-    turns: tuple[float, ...] = (0.0,), aways: tuple[float, ...] = (AWAY,),
+    turns: tuple[float, ...] = (0.0,), views: tuple[View, ...] = (AWAY,),
 ) -> list[Track]:  # fmt: skip
-    """The cheapest path through headings and postures, for each of `aways`.
+    """The cheapest path through headings and postures, for each of `views`.
 
     Args:
         x, guess: of one hypothesis, which says position, size and the heading that `turns` are added to.
         postures: (N, B, 3) rad.
         turns: rad, headings against the guess's, evenly spaced around the circle, or just (0,).
-        aways: costs of a back seen square on; a negative one prefers it.
+        views: what speaks for a heading: the cost of a back seen square on (a negative one prefers it), or evidence.
     """
     obs = problem.obs
     F, N = len(obs.at), len(postures)
@@ -90,11 +94,10 @@ def tracks(
     fits = [frame_costs(problem, wide, replace(base, yaw=base.yaw + turn), seen) for turn in turns]
     sure = obs.quality[seen].numpy()  # frames whose mask is doubtful say little
     fit = np.stack(fits) * sure + (TRAVEL * moving * (1 - np.cos(yaw - root.heading[at])) / 2)[:, None]
-    back = np.maximum(-np.cos(yaw - to_camera), 0)[:, None]
     step = _steps(len(turns), postures)
     out = []
-    for away in aways:
-        table = (fit + away * back).reshape(len(turns) * N, -1).T
+    for view in views:
+        table = (fit + _view_cost(view, yaw, to_camera, seen)[:, None]).reshape(len(turns) * N, -1).T
         path = viterbi(table, step)
         way, posture = path // N, path % N
         turned = np.unwrap(np.asarray(turns)[way])[:, None]
@@ -105,6 +108,15 @@ def tracks(
         out.append(Track(guess.yaw[0].numpy() + turned[:, 0], q.reshape(-1, *postures.shape[1:]), cheapest,
                          np.bincount(posture, minlength=N)))  # fmt: skip
     return out
+
+
+def _view_cost(view: View, yaw: Array, to_camera: Array, seen: Tensor) -> Array:
+    """(N, S) cost of the headings yaw (N, S) of the fit frames `seen` with the camera in direction to_camera (S,)."""
+    if isinstance(view, float):
+        return view * np.maximum(-np.cos(yaw - to_camera), 0)
+    azimuth = torch.as_tensor(to_camera - yaw, dtype=torch.float32)
+    cost = evidence_terms.at_azimuth(evidence_terms.doubtful(view.view[seen]), azimuth)
+    return SAID * (cost * view.view_weight[seen]).numpy()
 
 
 def _steps(headings: int, postures: Tensor) -> Array:

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from slomo.reconstruct import losses, silhouette
+from slomo.reconstruct.evidence import Evidence
 from slomo.reconstruct.kinematics import Kinematics, rot
 from slomo.reconstruct.observations import Observations
 from slomo.reconstruct.trajectory import Guess, Trajectory
@@ -32,6 +33,7 @@ class Problem:
         weights: of the terms by name; a term whose weight is 0 is not evaluated.
         tilt_spread: s.d. of the camera's pitch and roll against gravity, rad.
         terms: the evidence.
+        said: what networks and the user say about the clip, where anything is.
     """
 
     obs: Observations
@@ -40,6 +42,7 @@ class Problem:
     weights: Mapping[str, float]
     tilt_spread: float
     terms: Mapping[str, losses.Term] = field(default_factory=lambda: losses.TERMS)
+    said: Evidence | None = None
 
     def variables(self, H: int, generator: torch.Generator) -> Variables:
         shape = {f"shape.{k}": v for k, v in self.kin.shape_variables(H).items()}
