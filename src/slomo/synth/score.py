@@ -25,6 +25,21 @@ def _at(t: np.ndarray, motion: KeypointMotion, names: list[str], tolerance: floa
     return out
 
 
+def _swapped(X: np.ndarray, Y: np.ndarray, names: list[str], feet: list[str]) -> list[str]:
+    """The left feet of pairs in X (T, N, 3) that fit the truth Y better with left and right exchanged."""
+    out = []
+    for left in feet:
+        right = left.replace("left", "right")
+        if left == right or left not in names or right not in names:
+            continue
+        i, j = names.index(left), names.index(right)
+        own = np.linalg.norm(X[:, [i, j]] - Y[:, [i, j]], axis=-1).sum(1)
+        other = np.linalg.norm(X[:, [i, j]] - Y[:, [j, i]], axis=-1).sum(1)
+        if np.nanmean(other) < np.nanmean(own):
+            out.append(left)
+    return out
+
+
 def score(motion: KeypointMotion, truth: Mapping[str, Any]) -> dict[str, Any]:
     """Compare key points with the arrays of a `truth.npz`; names that both have count.
 
@@ -34,6 +49,7 @@ def score(motion: KeypointMotion, truth: Mapping[str, Any]) -> dict[str, Any]:
         foot_mpjpe_percent: the same, of the feet.
         root_path_error_percent: mean distance of the root (same alignment), in per cent of the distance that it
             travelled; None for a subject that stays within half its length.
+        swapped: feet "front_left_paw" etc. of the pairs that lie nearer, over the whole motion, to each other's truth.
         gravity_error_degrees: angle between the two verticals in that alignment.
         matched: number of common key points.  coverage: part of the true frames with at least four of them.
 
@@ -60,6 +76,7 @@ def score(motion: KeypointMotion, truth: Mapping[str, Any]) -> dict[str, Any]:
     error = np.where(ok, np.linalg.norm(s * X @ R.T + shift - Y, axis=-1), np.nan)
 
     percent = 100 / length
+    placed = s * X @ R.T + shift
     feet = [names.index(n) for n in map(str, truth["foot_names"]) if n in names]
     root = next((n for n in ROOTS if n in names), None)
     path_error = None
@@ -75,6 +92,7 @@ def score(motion: KeypointMotion, truth: Mapping[str, Any]) -> dict[str, Any]:
         w_mpjpe_percent=float(np.nanmean(error) * percent),
         foot_mpjpe_percent=float(np.nanmean(error[:, feet]) * percent) if feet else None,
         root_path_error_percent=path_error,
+        swapped=_swapped(placed, Y, names, [str(n) for n in truth["foot_names"]]),
         gravity_error_degrees=float(np.degrees(np.arccos(np.clip(R[2, 2], -1, 1)))),
         matched=len(names),
         coverage=len(frames) / len(Y),

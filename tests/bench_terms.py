@@ -1,0 +1,118 @@
+"""What each term of the prior does to the reconstruction: one table over rendered clips, `make bench-terms`.
+
+    python tests/bench_terms.py OUT [--seeds 2] [--terms all] [--clips a,b]
+
+Every cell is `slomo reconstruct` in a project below OUT, so a bench that was stopped goes on; the figures are ratios to
+the fit without the prior. Clips: those in ../shared/truth where there are any, and some that slomo renders.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from slomo.formats import load_keypoints
+from slomo.synth.score import score
+
+ROOT = Path(__file__).parents[1]
+SHARED = ROOT.parent / "shared"
+TERMS = ("view", "keypoints", "parts", "surface")
+SYNTH = {
+    "synth_trot_cat": ["--animal", "cat", "--gait", "trot", "--view", "40", "--camera", "orbit", "--seed", "21"],
+    "synth_turn_horse": ["--animal", "horse", "--gait", "walk", "--turn", "35", "--view", "-20", "--seed", "22"],
+}
+
+
+def variants(which: str) -> dict[str, list[str]]:
+    """Name -> options: without the prior, with each term alone, with all but one, with all."""
+    off = {t: f"--set=reconstruct.weight_{t}=0" for t in TERMS}
+    out = {"none": ["--prior", "none"], "all": []}
+    if which == "all":
+        out |= {f"only {t}": [off[o] for o in TERMS if o != t] for t in TERMS}
+        out |= {f"all but {t}": [off[t]] for t in TERMS}
+    return out
+
+
+def slomo(*args: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", "slomo", *args],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )
+    if done.returncode not in (0, 1):
+        raise SystemExit(done.stderr)
+    return done.stdout.strip()
+
+
+def clips(out: Path) -> dict[str, Path]:
+    found = {p.parent.name: p.parent for p in sorted((SHARED / "truth").glob("*/truth.npz"))}
+    for name, options in SYNTH.items():
+        folder = out / "clips" / name
+        if not (folder / "truth.npz").exists():
+            slomo("synth", str(folder), *options)
+        found[name] = folder
+    return found
+
+
+def run(out: Path, name: str, clip: Path, options: list[str], seed: int) -> dict:
+    truth = np.load(clip / "truth.npz")
+    project = out / "runs" / name
+    project.mkdir(parents=True, exist_ok=True)
+    weights = SHARED / "weights" / "u2netp.onnx"
+    args = ["--skeleton", "human"] if str(truth["kind"]) == "human" else []
+    args += ["--weights", str(weights)] if weights.exists() else []
+    # Every parameter that a variant may have changed is set anew.
+    reset = [f"--set=reconstruct.weight_{t}={default}" for t, default in defaults().items()]
+    given = {o.split("=")[1] for o in options if o.startswith("--set")}
+    reset = [r for r in reset if r.split("=")[1] not in given]
+    prior = [] if "--prior" in options else ["--prior", "auto"]
+    path = slomo(
+        "--project", str(project), "reconstruct", str(clip / "clip.mp4"), *args, *prior, *options, *reset,
+        f"--set=reconstruct.seed={seed}",
+    )  # fmt: skip
+    folder = Path(path)
+    motion = load_keypoints(folder / "keypoints.npz")
+    report = json.loads((folder / "report.json").read_text())
+    return score(motion, truth) | {"cpu_seconds": report["cpu_seconds"]}
+
+
+def defaults() -> dict[str, float]:
+    from slomo.reconstruct.fit_stage import FitConfig
+
+    return {t: getattr(FitConfig(), f"weight_{t}") for t in TERMS}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--terms", choices=("some", "all"), default="all")
+    parser.add_argument("--clips", default="")
+    args = parser.parse_args()
+    chosen = {n: p for n, p in clips(args.out).items() if not args.clips or n in args.clips.split(",")}
+    print(
+        f"{'clip':<18} {'variant':<20} {'PA %':>6} {'W %':>6} {'feet %':>7} {'PA ratio':>9} {'swaps':>7} {'CPU ratio':>9}"
+    )
+    for name, clip in chosen.items():
+        base: dict[str, float] = {}
+        for variant, options in variants(args.terms).items():
+            rows = [run(args.out, name, clip, options, seed) for seed in range(args.seeds)]
+            mean = {k: float(np.mean([r[k] for r in rows])) for k in
+                    ("pa_mpjpe_percent", "w_mpjpe_percent", "foot_mpjpe_percent", "cpu_seconds")}  # fmt: skip
+            base = base or mean
+            swaps = sum(bool(r["swapped"]) for r in rows)
+            print(
+                f"{name:<18} {variant:<20} {mean['pa_mpjpe_percent']:6.1f} {mean['w_mpjpe_percent']:6.1f} "
+                f"{mean['foot_mpjpe_percent']:7.1f} {mean['pa_mpjpe_percent'] / base['pa_mpjpe_percent']:9.2f} "
+                f"{swaps:3d}/{len(rows):<3d} {mean['cpu_seconds'] / base['cpu_seconds']:9.2f}",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
