@@ -95,9 +95,8 @@ def main() -> None:
     parser.add_argument("--clips", default="")
     args = parser.parse_args()
     chosen = {n: p for n, p in clips(args.out).items() if not args.clips or n in args.clips.split(",")}
-    print(
-        f"{'clip':<18} {'variant':<20} {'PA %':>6} {'W %':>6} {'feet %':>7} {'PA ratio':>9} {'swaps':>7} {'CPU ratio':>9}"
-    )
+    heads = ("PA %", "W %", "feet %", "PA ratio", "swaps", "CPU ratio")
+    print(f"{'clip':<18} {'variant':<20} " + " ".join(f"{h:>9}" for h in heads))
     for name, clip in chosen.items():
         base: dict[str, float] = {}
         for variant, options in variants(args.terms).items():
@@ -106,12 +105,10 @@ def main() -> None:
                     ("pa_mpjpe_percent", "w_mpjpe_percent", "foot_mpjpe_percent", "cpu_seconds")}  # fmt: skip
             base = base or mean
             swaps = sum(bool(r["swapped"]) for r in rows)
-            print(
-                f"{name:<18} {variant:<20} {mean['pa_mpjpe_percent']:6.1f} {mean['w_mpjpe_percent']:6.1f} "
-                f"{mean['foot_mpjpe_percent']:7.1f} {mean['pa_mpjpe_percent'] / base['pa_mpjpe_percent']:9.2f} "
-                f"{swaps:3d}/{len(rows):<3d} {mean['cpu_seconds'] / base['cpu_seconds']:9.2f}",
-                flush=True,
-            )
+            cells = [f"{mean[k]:9.1f}" for k in ("pa_mpjpe_percent", "w_mpjpe_percent", "foot_mpjpe_percent")]
+            cells += [f"{mean['pa_mpjpe_percent'] / base['pa_mpjpe_percent']:9.2f}", f"{swaps:>5}/{len(rows):<3}"]
+            cells += [f"{mean['cpu_seconds'] / base['cpu_seconds']:9.2f}"]
+            print(f"{name:<18} {variant:<20} " + " ".join(cells), flush=True)
 
 
 if __name__ == "__main__":

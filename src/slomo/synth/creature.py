@@ -11,7 +11,7 @@ import numpy as np
 from slomo.prior.labels import labels
 from slomo.skeleton import Skeleton
 from slomo.synth.coat import coat
-from slomo.synth.flesh import Cone, mesh
+from slomo.synth.flesh import Cone, mesh, value_noise
 from slomo.synth.variety import Build, build, extras
 
 Array = np.ndarray
@@ -82,6 +82,15 @@ class Creature:
         return coat(self.skeleton, self.link, self.surface, rng)
 
 
+def _roughened(vertices: Array, triangles: Array, amount: float, rng: np.random.Generator) -> Array:
+    """Vertices pushed along their normals by noise of up to `amount`."""
+    corner = vertices[triangles]
+    face = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal = np.stack([np.bincount(triangles.ravel(), np.repeat(f, 3), len(vertices)) for f in face.T], 1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    return vertices + amount * (2 * value_noise(vertices * 25, rng) - 1)[:, None] * normal
+
+
 def create(skeleton: Skeleton, seed: int) -> Creature:
     """A member, by seed, of the family that the skeleton stands for."""
     rng = np.random.default_rng([seed, 11])
@@ -95,6 +104,10 @@ def create(skeleton: Skeleton, seed: int) -> Creature:
     ends = np.concatenate([ends, np.array([[e.a, e.b] for e in more]).reshape(-1, 2, 3)])
     radii = np.concatenate([what.radii, np.array([e.radii for e in more]).reshape(-1, 2)])
     ends = p[link][:, None] + (R[link][:, None] @ ends[..., None])[..., 0]
+    # Round cones in a space that is stretched sideways make a body that is deeper than wide.
+    stretch = np.ones(3)
+    stretch[0 if skeleton.kind == "human" else 1] = 1 / what.squash
+    ends = ends * stretch
     cones = [Cone(int(k), a, b + 1e-6, *r) for k, (a, b), r in zip(link, ends, radii, strict=True)]
     vertices, triangles = mesh(cones, cell=0.38 * float(np.median(skeleton.capsule_radii)), blend=0.012)
     distance = np.stack([c.distance(vertices) for c in cones], 1)
@@ -115,6 +128,7 @@ def create(skeleton: Skeleton, seed: int) -> Creature:
         s[mine] = cone.along(vertices[mine])
         away = vertices[mine] - cone.a - s[mine, None] * (cone.b - cone.a)
         n[mine] = (away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)) @ R[cone.bone]
+    vertices = _roughened(vertices, triangles, what.fur, rng) / stretch
     return Creature(
         skeleton, what, what.offset, vertices, triangles, weights / weights.sum(1, keepdims=True), part,
         known.canonical(capsule, s, n), near.argmin(1), R, p[: skeleton.link_count],

@@ -13,7 +13,7 @@ Array = np.ndarray
 # Factor on the length of every bone of a group, drawn evenly in its logarithm: from a dachshund's legs to a camel's.
 GROUPS = {
     "quadruped": dict(
-        trunk=(0.92, 1.1), shoulder=(0.8, 1.25), neck=(0.5, 1.8), head=(0.65, 1.4), tail=(0.15, 1.7),
+        trunk=(0.92, 1.1), shoulder=(0.88, 1.14), neck=(0.5, 1.8), head=(0.65, 1.4), tail=(0.15, 1.7),
     ),
     "human": dict(trunk=(0.88, 1.12), arm=(0.85, 1.12), leg=(0.75, 1.1), head=(0.9, 1.7)),
 }  # fmt: skip
@@ -33,12 +33,16 @@ class Build:
 
     Attributes:
         offset: (M, 3) nodes in their links.  radii, shift: (C, 2), (C, 2, 3) of the skeleton's capsules.
+        squash: factor on the whole body's width (animals are deeper than wide), of people on their depth.
+        fur: body lengths, roughness of the outline.
         bind: (B, 3) rad, the pose in which the skin is made.  stance: (B, 3) rad, how it carries itself at rest.
     """
 
     offset: Array
     radii: Array
     shift: Array
+    squash: float
+    fur: float
     bind: Array
     stance: Array
 
@@ -102,7 +106,11 @@ def build(skeleton: Skeleton, rng: np.random.Generator) -> Build:
     spread = 0.35 if kind == "quadruped" else 0.15
     stance = sided(skeleton, spread * skeleton.sigma[:B] * rng.standard_normal((B, 3)) * [0.3, 1.0, 0.0])
     stance[0] = 0
-    return Build(offset, radii, skeleton.capsule_shift * np.array([1, width, 1]), bind, stance)
+    squash, fur = (
+        rng.uniform(0.7, 1.08),
+        (0.0 if rng.random() < 0.5 else rng.uniform(0, 0.25) * float(np.median(radii))),
+    )
+    return Build(offset, radii, skeleton.capsule_shift * np.array([1, width, 1]), squash, fur, bind, stance)
 
 
 def extras(skeleton: Skeleton, what: Build, rng: np.random.Generator) -> list[Extra]:
@@ -155,6 +163,15 @@ def extras(skeleton: Skeleton, what: Build, rng: np.random.Generator) -> list[Ex
         z, r = u(-0.28, -0.15), u(0.07, 0.12)
         for y in (1, -1):
             add("spine_mid", [-0.3, 0.08 * y, z], [spine[0], 0.08 * y, z], r, r, "trunk")
+    upper = {n: float(what.radii[list(skeleton.capsule_names).index(n)].max()) for n in
+             ("front_left_upper_arm", "hind_left_thigh")}  # fmt: skip
+    for side in ("left", "right"):  # limbs hang together with the trunk, however wide and thin it is
+        limb = what.offset[number[f"front_{side}_shoulder"]]
+        r = 0.8 * upper["front_left_upper_arm"]
+        add("spine_mid", [0.8 * limb[0], 0, 0.3 * limb[2]], limb * [1, 0.8, 1], r, r, "trunk")
+        limb = what.offset[number[f"hind_{side}_hip"]]
+        r = 0.7 * upper["hind_left_thigh"]
+        add("pelvis", [0, 0, -0.04], limb * [1, 0.8, 1], r, r, "trunk")
     bush = u(0.5, 1.0) * (u(1.0, 2.2) if chance(0.3) else 1.0) * 0.05
     if chance(0.5):
         add("tail_mid", [0, 0, 0], what.offset[number["tail_tip"]], bush, 0.6 * bush, "tail")
