@@ -42,10 +42,18 @@ class FitConfig:
     length_m: float = 0.5
     iterations: int = 20
     seed: int = 0
+    fps: float = 15.0
 
     def __post_init__(self):
         if self.iterations < 1:
             raise UsageError(f"iterations = {self.iterations}: expected at least 1")
+
+
+@dataclasses.dataclass(frozen=True)
+class EvidenceConfig:
+    prior: str = "auto"
+    skeleton: str = "quadruped"
+    fps: float = 15.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +86,11 @@ def run_masks(inputs: Inputs, config: MasksConfig, progress: Progress) -> Artifa
 
 def run_camera(inputs: Inputs, config: CameraConfig, progress: Progress) -> Artifact:
     return Artifact(npz={"camera.npz": {"K": np.eye(3) * (1 + config.fov_deg)}})
+
+
+def run_evidence(inputs: Inputs, config: EvidenceConfig, progress: Progress) -> Artifact:
+    report = {"skeleton": config.skeleton, "files": sorted(inputs.files)}
+    return Artifact(npz={"evidence.npz": {"frame": np.zeros(0, int)}}, json={"report.json": report})
 
 
 def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
@@ -137,8 +150,8 @@ def run_report(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
 def replacements() -> dict[str, pipeline.StageSpec]:
     """The table with these stages."""
     real = {n: s for n, s in pipeline.STAGES.items() if n != "import"}
-    runs = {n: "run_report" if n == "report" else s.run for n, s in real.items()}
-    return {n: dataclasses.replace(s, module="fake_line", run=runs[n]) for n, s in real.items()}
+    own = {"report": {"run": "run_report"}, "evidence": {"run": "run_evidence", "config": "EvidenceConfig"}}
+    return {n: dataclasses.replace(s, module="fake_line", **own.get(n, {})) for n, s in real.items()}
 
 
 def install() -> None:
@@ -146,6 +159,7 @@ def install() -> None:
     pipeline.STAGES.update(replacements())
     pipeline.load_robot = load_robot
     pipeline._find_weights = lambda: None
+    pipeline._find_prior = lambda skeleton: None
 
 
 def load_robot(name: str) -> SimpleNamespace:

@@ -30,6 +30,7 @@ def project(tmp_path, monkeypatch):
         monkeypatch.setitem(pipeline.STAGES, name, spec)
     monkeypatch.setattr(pipeline, "load_robot", fake_line.load_robot)
     monkeypatch.setattr(pipeline, "_find_weights", lambda: None)
+    monkeypatch.setattr(pipeline, "_find_prior", lambda skeleton: None)
     return tmp_path
 
 
@@ -95,7 +96,7 @@ def test_every_command_of_the_line(project):
     assert path(run("report", "--robot", "go1")).parent.name == "report"
     assert path(run("run", "--robot", "a1", "--duration", "0")).parent.name == "report"
     assert {p.name for p in (project / "out").iterdir()} == {
-        *(f"{s}.json" for s in ("decode", "masks", "camera", "reconstruct")),
+        *(f"{s}.json" for s in ("decode", "masks", "camera", "evidence", "reconstruct")),
         *(f"{s}-{r}.json" for s in ("retarget", "optimize", "track", "report") for r in ("go1", "a1")),
     }
 
@@ -105,8 +106,8 @@ def test_json_is_the_manifest(project):
     m = json.loads(done.stdout)
     assert m == json.loads((project / m["directory"] / "manifest.json").read_text())
     listed = json.loads(run("status", "--json").stdout)["stages"]
-    assert [s["status"] for s in listed] == ["current"] * 4
-    assert listed[3]["manifest"]["seconds"] >= 0
+    assert [s["status"] for s in listed] == ["current"] * 5
+    assert listed[4]["manifest"]["seconds"] >= 0
     assert json.loads(run("init", "--json").stdout)["new"] is False
     assert json.loads(run("gc", "--json").stdout) == {"dry_run": False, "bytes": 0, "removed": []}
     assert "go1" in json.loads(run("robots", "--json").stdout)
@@ -169,7 +170,10 @@ def test_masks_given_are_used(project):
     ("text", "message"),
     [
         ("[decode]\nstrat = 1.0", "[decode]: no parameter 'strat' (valid: start, duration); did you mean 'start'?"),
-        ("[decoed]\nstart = 1.0", "no section 'decoed' (valid: inputs, decode, masks, camera, reconstruct, import"),
+        (
+            "[decoed]\nstart = 1.0",
+            "no section 'decoed' (valid: inputs, decode, masks, camera, evidence, reconstruct",
+        ),
         ("[decode]\nstart = 'soon'", "[decode]: start = 'soon': expected a valid number"),
         ("[reconstruct]\niterations = 2.5", "iterations = 2.5: expected a valid integer"),
         ("[decode]\nstart = nan", "start = nan: expected a finite number"),
@@ -199,6 +203,32 @@ def test_wrong_set_options_leave_the_file_alone(project):
     ]:
         assert message in run("reconstruct", "--set", option, code=2).stderr
     assert (project / "slomo.toml").read_text() == before
+
+
+def test_who_is_asked_what_the_clip_shows(project):
+    def given():
+        tables = settings.read(project, list(pipeline.STAGES))
+        return tables.get("evidence", {}), {k: v for k, v in tables["inputs"].items() if k != "clip"}
+
+    for name in ("points.json", "own.onnx", "model.onnx", "map.toml"):
+        (project / name).write_text("")
+    done = run("reconstruct", "clip.txt", "--prior", "none", "--keypoints2d", "points.json")
+    assert given() == ({"prior": "none"}, {"keypoints2d": "points.json"})
+    artifact = json.loads((project / "out" / "evidence.json").read_text())
+    files = json.loads((project / artifact["directory"] / "report.json").read_text())["files"]
+    assert files == ["keypoints2d"]
+    assert "reconstruct: done" in done.stderr
+    assert "evidence: cached" in run("reconstruct", "--length", "0.7").stderr
+    run("run", "--robot", "go1", "--prior", "own.onnx", "--keypoints2d", "none")
+    assert given() == ({}, {"prior": "own.onnx"})
+    run("reconstruct", "--prior", "auto", "--keypoint-model", "model.onnx", "--keypoint-map", "map.toml")
+    assert given() == ({}, {"keypoint_model": "model.onnx", "keypoint_map": "map.toml"})
+    run("reconstruct", "--keypoint-model", "none")
+    assert given() == ({}, {})
+    assert "needs --keypoint-map too" in run("reconstruct", "--keypoint-model", "model.onnx", code=2).stderr
+    assert "needs --keypoint-model too" in run("reconstruct", "--keypoint-map", "map.toml", code=2).stderr
+    assert "nothing.onnx: no such file or folder; give" in run("reconstruct", "--prior", "nothing.onnx", code=4).stderr
+    assert "nothing.json: no such file" in run("run", "--robot", "go1", "--keypoints2d", "nothing.json", code=4).stderr
 
 
 def test_a_file_that_cannot_be_edited_by_line(project):
@@ -303,7 +333,7 @@ def test_gc_keeps_what_is_used(project):
     would = run("gc", "--dry-run")
     assert "would free" in would.stderr
     assert {line.split("/")[2] for line in would.stdout.splitlines()} == {
-        "decode", "masks", "camera", "reconstruct", "report",
+        "decode", "masks", "camera", "evidence", "reconstruct", "report",
     }  # fmt: skip
     assert run("gc").stdout == would.stdout
     assert run("gc").stdout == "\n"

@@ -33,6 +33,7 @@ def project(tmp_path, monkeypatch):
         monkeypatch.setitem(pipeline.STAGES, name, spec)
     monkeypatch.setattr(pipeline, "load_robot", fake_line.load_robot)
     monkeypatch.setattr(pipeline, "_find_weights", lambda: None)
+    monkeypatch.setattr(pipeline, "_find_prior", lambda skeleton: None)
     return tmp_path
 
 
@@ -71,12 +72,14 @@ def test_the_table_names_what_there_is():
 
 
 def test_every_option_of_reconstruct_is_a_parameter():
-    parameters = {s: STAGES[s].of_module(STAGES[s].config) for s in ("decode", "masks", "camera", "reconstruct")}
+    stages = ("decode", "masks", "camera", "evidence", "reconstruct")
+    parameters = {s: STAGES[s].of_module(STAGES[s].config) for s in stages}
     for stage, name in [
         ("decode", "start"),
         ("decode", "duration"),
         ("masks", "segmenter"),
         ("camera", "fov_deg"),
+        ("evidence", "prior"),
         ("reconstruct", "length_m"),
         ("reconstruct", "skeleton"),
     ]:
@@ -104,7 +107,7 @@ def test_where_the_key_points_come_from(tmp_path):
     with pytest.raises(MissingInput, match="no motion yet; run `slomo reconstruct CLIP` or `slomo import KEYPOINTS`"):
         write_inputs(tmp_path).chain("retarget")
     assert write_inputs(tmp_path, clip="a.mp4").chain("retarget") == [
-        "decode", "masks", "camera", "reconstruct", "retarget",
+        "decode", "masks", "camera", "evidence", "reconstruct", "retarget",
     ]  # fmt: skip
     assert write_inputs(tmp_path, keypoints="a.json").chain("report") == [
         "import", "retarget", "optimize", "track", "report",
@@ -132,13 +135,32 @@ def test_weights_at_hand_are_an_input(tmp_path, monkeypatch):
     assert write_inputs(tmp_path, clip="c").files("masks") == {"weights": tmp_path / "u2netp.onnx"}
 
 
+def test_the_prior_of_the_skeleton_s_kind_is_an_input(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(pipeline, "_find_prior", lambda skeleton: asked.append(str(skeleton)) or tmp_path / "own.onnx")
+    project = write_inputs(tmp_path, clip="c", keypoints2d="p.json")
+    assert project.files("evidence") == {"prior": tmp_path / "own.onnx", "keypoints2d": tmp_path / "p.json"}
+    text = (tmp_path / settings.FILE).read_text()
+    (tmp_path / settings.FILE).write_text(text + '[reconstruct]\nskeleton = "human"\nfps = 12.0\n')
+    project = Project(tmp_path)
+    assert project.files("evidence")["prior"] == tmp_path / "own.onnx"
+    assert asked == ["quadruped", "human"]
+    assert (project.config("evidence").skeleton, project.config("evidence").fps) == ("human", 12.0)
+    (tmp_path / settings.FILE).write_text(text + 'prior = "mine.onnx"\n[evidence]\nfps = 5.0\n')
+    assert Project(tmp_path).files("evidence")["prior"] == tmp_path / "mine.onnx"
+    assert Project(tmp_path).config("evidence").fps == 5.0
+    (tmp_path / settings.FILE).write_text(text + 'prior = "mine.onnx"\n[evidence]\nprior = "none"\n')
+    assert Project(tmp_path).files("evidence").keys() == {"keypoints2d"}
+
+
 def test_everything_is_cached_the_second_time(project):
     first = slomo("run", "clip.txt", "--robot", "go1", check=0)
     entry = Path(first.stdout.strip())
-    assert (entry / "side_by_side.mp4").read_bytes() == b"camera decode masks optimize reconstruct retarget track"
+    stages = b"camera decode evidence masks optimize reconstruct retarget track"
+    assert (entry / "side_by_side.mp4").read_bytes() == stages
     again = slomo("run", "--robot", "go1", check=0)
     assert again.stdout == first.stdout
-    assert again.stderr.count(": cached") == 8
+    assert again.stderr.count(": cached") == 9
     assert "done in" not in again.stderr
 
 

@@ -27,6 +27,7 @@ class StageSpec:
         files: roles of the user's files that it takes (see `settings.INPUTS`); `optional` ones where they are given.
         robot: whether it takes the robot.
         inspects: whether it also takes an artifact that failed, to show it.
+        shares: parameters that are those of `reconstruct` unless its own section sets them.
         command: what the user types to make its artifact.
     """
 
@@ -41,6 +42,7 @@ class StageSpec:
     optional: tuple[str, ...] = ()
     robot: bool = False
     inspects: bool = False
+    shares: tuple[str, ...] = ()
 
     def of_module(self, name: str) -> Any:
         """An attribute of the stage's module, which is imported only now: some take seconds."""
@@ -77,8 +79,12 @@ STAGES: dict[str, StageSpec] = {
             "camera", _RECONSTRUCT, "reconstruct", "run_camera", "CameraConfig", "CAMERA_VERSION", ("decode", "masks")
         ),
         StageSpec(
+            "evidence", "slomo.prior.stage", "reconstruct", upstream=("decode", "masks"), shares=("skeleton", "fps"),
+            optional=("skeleton", "prior", "keypoints2d", "keypoint_model", "keypoint_map"),
+        ),
+        StageSpec(
             "reconstruct", "slomo.reconstruct.fit_stage", "reconstruct", "run_fit", "FitConfig", "FIT_VERSION",
-            ("decode", "masks", "camera"), optional=("skeleton",),
+            ("decode", "masks", "camera", "evidence"), optional=("skeleton",),
         ),
         StageSpec(
             "import", "slomo.pipeline", "import", "run_import", "ImportConfig", "IMPORT_VERSION", (), ("keypoints",)
@@ -88,11 +94,11 @@ STAGES: dict[str, StageSpec] = {
         StageSpec("track", "slomo.track.stage", "track --sim", upstream=("optimize",), robot=True),
         StageSpec(
             "report", "slomo.report.stage", "report", robot=True, inspects=True, optional=("truth",),
-            upstream=("decode", "masks", "camera", "reconstruct", "retarget", "optimize", "track"),
+            upstream=("decode", "masks", "camera", "evidence", "reconstruct", "retarget", "optimize", "track"),
         ),
     )
 }  # fmt: skip
-_FROM_CLIP = ("decode", "masks", "camera", "reconstruct")
+_FROM_CLIP = ("decode", "masks", "camera", "evidence", "reconstruct")
 
 
 def load_robot(name_or_path: str) -> "Robot":
@@ -106,6 +112,14 @@ def _find_weights() -> Path | None:
     from slomo.reconstruct.u2net import find_weights
 
     return find_weights()
+
+
+def _find_prior(skeleton: str | Path) -> Path | None:
+    """The weights that come with slomo for the kind of this skeleton. Raises `UsageError`, `InvalidData`."""
+    from slomo.prior.inference import packaged
+    from slomo.skeleton import load_skeleton
+
+    return packaged(load_skeleton(skeleton).kind)
 
 
 @dataclass(frozen=True)
@@ -203,7 +217,10 @@ class Project:
     def config(self, stage: str) -> Any:
         """The stage's parameters: its defaults and slomo.toml over them. Raises `UsageError`."""
         where = f"{self.root / settings.FILE} [{stage}]"
-        return settings.make(STAGES[stage].of_module(STAGES[stage].config), self.tables.get(stage, {}), where=where)
+        table = self.tables.get(stage, {})
+        if shares := STAGES[stage].shares:
+            table = {name: getattr(self.config("reconstruct"), name) for name in shares} | table
+        return settings.make(STAGES[stage].of_module(STAGES[stage].config), table, where=where)
 
     def files(self, stage: str) -> dict[str, Path]:
         """Role -> the user's file that the stage takes. Raises `MissingInput` for one that is needed."""
@@ -216,6 +233,8 @@ class Project:
                 )
         if "weights" in spec.optional:
             self._choose_masks(found, self.tables.get(stage, {}).get("segmenter", "auto"))
+        if "prior" in spec.optional:
+            self._choose_prior(found, self.config(stage))
         return found
 
     @staticmethod
@@ -227,6 +246,14 @@ class Project:
             found.pop("weights", None)
         elif "weights" not in found and (weights := _find_weights()):
             found["weights"] = weights
+
+    @staticmethod
+    def _choose_prior(found: dict[str, Path], config: Any) -> None:
+        """Slomo's own network where the user gave none; none at all where it is switched off."""
+        if config.prior == "none":
+            found.pop("prior", None)
+        elif "prior" not in found and (weights := _find_prior(found.get("skeleton") or config.skeleton)):
+            found["prior"] = weights
 
     def identity(self, stage: str, upstream: Mapping[str, Manifest]) -> Identity:
         """What the stage's artifact is made from, given the artifacts before it."""

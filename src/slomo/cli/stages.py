@@ -22,6 +22,18 @@ LengthOption = Annotated[
     float | None, typer.Option("--length", help="Body length in metres (the clip alone cannot tell it).")
 ]
 FovOption = Annotated[float | None, typer.Option("--fov", help="Horizontal field of view in degrees.")]
+PriorOption = Annotated[
+    str | None, typer.Option("--prior", metavar="auto|none|FILE", help="Network that sees parts and key points.")
+]
+Keypoints2dOption = Annotated[
+    str | None, typer.Option("--keypoints2d", metavar="FILE|none", help="Your own 2-D key points (.json).")
+]
+ModelOption = Annotated[
+    str | None, typer.Option("--keypoint-model", metavar="FILE|none", help="A key-point network of yours (.onnx).")
+]
+MapOption = Annotated[
+    Path | None, typer.Option("--keypoint-map", help="What that network takes and gives (.toml), see docs/prior.md.")
+]
 TruthOption = Annotated[
     Path | None, typer.Option("--truth", help="truth.npz of a rendered clip: the report scores the reconstruction.")
 ]
@@ -46,6 +58,29 @@ def _skeleton(session: Session, skeleton: str | None) -> dict[str, dict[str, Any
     return {"inputs": {"skeleton": session.user_path(Path(skeleton), "skeleton")}}
 
 
+def _evidence(
+    session: Session, prior: str | None, keypoints2d: str | None, model: str | None, model_map: Path | None
+) -> dict[str, dict[str, Any]]:
+    """Who is asked what the clip shows. "none" unsets a file; a file of the user's own stands for --prior auto."""
+    evidence: dict[str, Any] = {}
+    inputs: dict[str, Any] = {}
+    if prior in ("auto", "none"):
+        evidence["prior"], inputs["prior"] = None if prior == "auto" else prior, None
+    elif prior is not None:
+        evidence["prior"], inputs["prior"] = None, session.user_path(Path(prior), "prior: auto, none or a file")
+    for role, name in (("keypoints2d", keypoints2d), ("keypoint_model", model)):
+        if name is not None:
+            inputs[role] = None if name == "none" else session.user_path(Path(name), role)
+    if model == "none":
+        inputs["keypoint_map"] = None
+    elif model_map is not None:
+        inputs["keypoint_map"] = session.user_path(model_map, "keypoint_map")
+    both = [bool(inputs[r]) if r in inputs else session.given(r) for r in ("keypoint_model", "keypoint_map")]
+    if both[0] != both[1]:
+        raise UsageError(f"needs --keypoint-{'map' if both[0] else 'model'} too", where="--keypoint-model")
+    return {"evidence": evidence, "inputs": inputs}
+
+
 def _from_clip(
     session: Session,
     skeleton: str | None,
@@ -56,12 +91,14 @@ def _from_clip(
     duration: float | None,
     length: float | None,
     fov: float | None,
+    evidence: dict[str, dict[str, Any]],
 ) -> dict[str, dict[str, Any]]:
     """The options of `reconstruct` as entries of slomo.toml."""
     changes = _skeleton(session, skeleton)
     files = {"masks": masks, "weights": weights}
     inputs = {role: session.user_path(path, role) for role, path in files.items() if path is not None}
-    changes["inputs"] = changes.get("inputs", {}) | inputs
+    changes["inputs"] = changes.get("inputs", {}) | inputs | evidence["inputs"]
+    changes["evidence"] = evidence["evidence"]
     changes["decode"] = _given(start=start, duration=duration)
     changes["masks"] = _given(segmenter=segmenter)
     if masks is not None and segmenter is None:
@@ -90,8 +127,12 @@ def add_commands(app: typer.Typer) -> None:
         duration: DurationOption = None,
         length: LengthOption = None,
         fov: FovOption = None,
+        prior: PriorOption = None,
+        keypoints2d: Keypoints2dOption = None,
+        keypoint_model: ModelOption = None,
+        keypoint_map: MapOption = None,
     ) -> None:
-        """Key points in metres from a clip: decode, masks, camera, skeleton fit.
+        """Key points in metres from a clip: decode, masks, camera, evidence, skeleton fit.
 
         Options given here are written into slomo.toml, and hold until they are changed there or given anew.
 
@@ -99,8 +140,10 @@ def add_commands(app: typer.Typer) -> None:
         slomo reconstruct cat.mp4
         slomo reconstruct cat.mp4 --duration 4 --length 0.45
         slomo reconstruct man.mp4 --skeleton human
+        slomo reconstruct cat.mp4 --prior none --keypoints2d points.json
         """
-        changes = _from_clip(session, skeleton, segmenter, masks, weights, start, duration, length, fov)
+        evidence = _evidence(session, prior, keypoints2d, keypoint_model, keypoint_map)
+        changes = _from_clip(session, skeleton, segmenter, masks, weights, start, duration, length, fov, evidence)
         if clip is not None:
             changes["inputs"] |= {"clip": session.user_path(clip, "clip")} | session.choice_reopened("clip")
         project = session.configure(changes)
@@ -200,6 +243,10 @@ def add_commands(app: typer.Typer) -> None:
         duration: DurationOption = None,
         length: LengthOption = None,
         fov: FovOption = None,
+        prior: PriorOption = None,
+        keypoints2d: Keypoints2dOption = None,
+        keypoint_model: ModelOption = None,
+        keypoint_map: MapOption = None,
     ) -> None:
         """Everything, from the clip (or key points) to the robot and the report. What is current is kept.
 
@@ -208,7 +255,8 @@ def add_commands(app: typer.Typer) -> None:
         slomo run cat.mp4 --robot go1 --duration 4 --length 0.45
         slomo run cat00.json --robot go1
         """
-        changes = _from_clip(session, skeleton, segmenter, masks, weights, start, duration, length, fov)
+        evidence = _evidence(session, prior, keypoints2d, keypoint_model, keypoint_map)
+        changes = _from_clip(session, skeleton, segmenter, masks, weights, start, duration, length, fov, evidence)
         inputs = changes["inputs"]
         inputs |= _truth(session, truth)
         if source is not None:

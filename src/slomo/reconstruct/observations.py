@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from slomo.errors import InvalidData
+from slomo.prior.frames import every
 from slomo.reconstruct.silhouette import Intrinsics
 
 Array = np.ndarray
@@ -78,11 +79,7 @@ def observe(
     counts = dict(frames=len(frames_t), masks=T, flow=len(flow["flow"]) + 1, camera=len(camera["T_world_cam"]))
     if len(set(counts.values())) != 1:
         raise InvalidData(f"the parts disagree about the number of frames: {counts}", where="reconstruct")
-    rate = (T - 1) / max(float(frames_t[-1] - frames_t[0]), 1e-9)
-    step = max(1, round(rate / fps))
-    if step > T // 3:
-        step = 1
-    at = np.arange(0, T, step)
+    at = np.arange(0, T, every(frames_t, fps))
     full = unpack(masks["packed"][at], masks["shape"])
     area = full.sum((1, 2))
     if not (area > 0).any():

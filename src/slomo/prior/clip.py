@@ -1,0 +1,89 @@
+"""From which side the subject is seen, decided for the clip: a single picture of a body cannot tell its depth from the
+mirror image of it, and a network that is asked picture by picture jumps between the two. Bodies turn slowly.
+"""
+
+import numpy as np
+
+from slomo.prior.labels import BINS
+
+Array = np.ndarray
+
+TURN = np.radians(70.0)  # rad/s, a subject that turns faster is unlikely, the more so the faster
+CORRELATION = 0.2  # s: pictures as close as that look alike, and so do the errors; they count as one
+_LEAK = 1e-7  # probability of any jump at all: a cut, or a subject that was lost for a moment
+_NEAR = 2  # bins on either side of the path over which its place is refined
+
+CENTRES = 2 * np.pi * np.arange(BINS) / BINS
+
+
+def view_over_clip(p: Array, t: Array) -> tuple[Array, Array]:
+    """A hidden Markov model over the azimuth's bins (forward-backward and Viterbi; Rabiner, Proc. IEEE 1989).
+
+    Args:
+        p: (F, 36) probability of the bins in each frame by itself. t: (F,) s.
+
+    Returns:
+        (F, 36) probability given the whole clip; (F,) rad, the likeliest path, within its bin where the probability is.
+    """
+    log_p = np.log(np.maximum(p, 1e-6)) * independent(t)[:, None]
+    dt = np.diff(t)
+    unique, which = np.unique(np.round(dt, 4), return_inverse=True)
+    moves = np.array([_moves(x) for x in unique]).reshape(-1, BINS, BINS)
+    log_moves = np.log(moves)
+
+    F = len(p)
+    likely = np.exp(log_p - log_p.max(1, keepdims=True))
+    ahead, back = np.empty((F, BINS)), np.ones((F, BINS))
+    ahead[0] = likely[0] / likely[0].sum()
+    for f in range(1, F):
+        ahead[f] = likely[f] * (ahead[f - 1] @ moves[which[f - 1]])
+        ahead[f] /= ahead[f].sum()
+    for f in range(F - 2, -1, -1):
+        back[f] = moves[which[f]] @ (likely[f + 1] * back[f + 1])
+        back[f] /= back[f].sum()
+    marginal = ahead * back
+    marginal /= marginal.sum(1, keepdims=True)
+
+    best, came = log_p[0], np.zeros((F, BINS), int)
+    for f in range(1, F):
+        total = best[:, None] + log_moves[which[f - 1]]
+        came[f] = total.argmax(0)
+        best = total.max(0) + log_p[f]
+    path = np.empty(F, int)
+    path[-1] = best.argmax()
+    for f in range(F - 1, 0, -1):
+        path[f - 1] = came[f, path[f]]
+
+    offset = np.arange(-_NEAR, _NEAR + 1)
+    near = np.take_along_axis(marginal, (path[:, None] + offset) % BINS, 1)
+    shift = (near @ offset) / np.maximum(near.sum(1), 1e-12) * (2 * np.pi / BINS)
+    azimuth = CENTRES[path] + shift
+    return marginal.astype(np.float32), (np.mod(azimuth + np.pi, 2 * np.pi) - np.pi).astype(np.float32)
+
+
+def independent(t: Array) -> Array:
+    """(F,) in (0, 1]: what each frame counts, for frames at t (F,) s whose errors are alike over `CORRELATION`."""
+    gap = np.diff(t)
+    room = 0.5 * (np.concatenate([gap, gap[-1:]]) + np.concatenate([gap[:1], gap])) if len(gap) else np.ones(len(t))
+    return np.clip(room / CORRELATION, 0.05, 1.0)
+
+
+def _moves(dt: float) -> Array:
+    """(36, 36) probability to go from one bin to another within dt (s)."""
+    apart = np.abs(CENTRES[:, None] - CENTRES)
+    apart = np.minimum(apart, 2 * np.pi - apart)
+    moves = np.exp(-apart / (TURN * dt)) + _LEAK
+    return moves / moves.sum(1, keepdims=True)
+
+
+def up_over_clip(up: Array, view: Array, path: Array, t: Array, *, tau: float = 0.15) -> Array:
+    """(F, 3) unit up axes, averaged over about `tau` (s) of neighbours that see the subject from the clip's side.
+
+    Args:
+        up: (F, 3). view: (F, 36) of each frame by itself. path: (F,) rad of the clip. t: (F,) s.
+    """
+    apart = np.abs(np.mod(CENTRES - path[:, None] + np.pi, 2 * np.pi) - np.pi)
+    agrees = np.where(apart < np.radians(45), view, 0).sum(1) + 1e-3
+    weight = np.exp(-0.5 * ((t[:, None] - t) / tau) ** 2) * agrees
+    mean = weight @ up
+    return (mean / np.maximum(np.linalg.norm(mean, axis=-1, keepdims=True), 1e-6)).astype(np.float32)

@@ -1,0 +1,217 @@
+"""What the sources say about a clip: the networks, a model of the user's, the user's own points; sides decided."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from slomo.prior import sides
+from slomo.prior.clip import CENTRES, independent, up_over_clip, view_over_clip
+from slomo.prior.crop import Box, from_crop, network_input
+from slomo.prior.external import ExternalModel
+from slomo.prior.frames import Motion
+from slomo.prior.inference import Prior, mass_at, peaks
+from slomo.prior.labels import Labels, rotation_of
+from slomo.prior.user_keypoints import UserKeypoints
+from slomo.skeleton import Skeleton
+
+Array = np.ndarray
+
+GRID = 64  # side of the dense arrays that are kept
+_REACH = 0.012  # of the box's side: flow is averaged over this around a key point
+
+
+@dataclass(frozen=True)
+class Shots:
+    """The F frames that are looked at.
+
+    Attributes:
+        index: (F,) decoded frame. t: (F,) s. box: (F, 3) px. quality: (F,) of the masks, in [0, 1].
+        frames: (T, H, W, 3) uint8 of the whole clip. masks: (T, H, W) bool. motion: of the whole clip.
+    """
+
+    index: Array
+    t: Array
+    box: Array
+    quality: Array
+    frames: Array
+    masks: Array
+    motion: Motion
+
+    def carried(self, places: Array) -> Array:
+        """(F-1, ..., 2) px: places (F, ..., 2) px of each frame, carried to the next."""
+        out = np.empty((len(places) - 1, *places.shape[1:]))
+        for f in range(len(out)):
+            flat = places[f].reshape(-1, 2)
+            a, b = int(self.index[f]), int(self.index[f + 1])
+            out[f] = self.motion.carry(flat, a, b, _REACH * self.box[f, 2]).reshape(places[f].shape)
+        return out
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Key points of one source: n `names`, `places` (F, n, 2) px of the decoded frames, `confidence` (F, n)."""
+
+    names: tuple[str, ...]
+    places: Array
+    confidence: Array
+
+
+@dataclass(frozen=True)
+class Dense:
+    """What only slomo's own networks say, see `stage.run`: `arrays` by their names in the artifact."""
+
+    arrays: dict[str, Array]
+    axis: Array  # (F, 3) expected left axis of the body, view frame
+    length: Array  # (F,) px of a body length
+
+
+Say = Callable[[float], None]
+
+
+def from_network(
+    prior: Prior, skeleton: Skeleton, labels: Labels, shots: Shots, say: Say
+) -> tuple[Columns, Dense, dict[str, Any]]:
+    """Everything that slomo's network says, with the view and the sides of the clip; and a report."""
+    crops = np.empty((len(shots.index), 6, prior.size, prior.size), np.float32)
+    for f, frame in enumerate(shots.index):
+        box = Box(*shots.box[f])
+        crops[f] = network_input(shots.frames[frame], shots.masks[frame], shots.motion.at(int(frame)), box, prior.size)
+        say(0.3 * f / len(crops))
+    seen = prior(crops)
+    say(0.8)
+
+    view, path = view_over_clip(seen.view, shots.t)
+    up = up_over_clip(seen.up, seen.view, path, shots.t)
+    places, mass = peaks(seen.heat, seen.size)
+    parts, surface = seen.parts.copy(), seen.surface.copy()
+    sure = mass * seen.seen
+    px = from_crop(places, shots.box[:, None], seen.size)
+    axis = sides.sideways(view, up)
+    length = _body_length(labels, places, sure, view, up, seen.size) * shots.box[:, 2] / seen.size
+
+    report: dict[str, Any] = {"left_right": {}}
+    for pair in sides.limb_pairs(skeleton, labels):
+        left, right = pair.left, pair.right
+        cross = [mass_at(seen.heat[:, a], places[:, b], seen.size) for a, b in ((left, right), (right, left))]
+        alone = sides.from_heat(mass[:, left], mass[:, right], *cross)
+        alone += sides.from_visibility(seen.seen[:, left], seen.seen[:, right], axis)
+        swapped, report["left_right"][pair.name] = _settle(pair, skeleton.rest(), px, sure, alone, axis, length, shots)
+        cells = (places + 0.5) * (parts.shape[-1] / seen.size) - 0.5
+        other = sides.parts_disagree(parts, cells, sure, pair)
+        for x in (px, sure):
+            sides.swap_keypoints(x, pair, swapped)
+        sides.swap_parts(parts, surface, pair, swapped ^ other)
+    say(0.95)
+
+    apart = np.abs(np.mod(CENTRES - path[:, None] + np.pi, 2 * np.pi) - np.pi)
+    report |= {
+        "view_certainty": float(np.where(apart < np.radians(25), view, 0).sum(1).mean()),
+        "view_repaired_frames": int((np.where(apart < np.radians(45), seen.view, 0).sum(1) < 0.5).sum()),
+    }
+    arrays = {
+        "view": view,
+        "view_up": up,
+        "view_path": path,
+        "parts": np.rint(255 * _grid(parts)).astype(np.uint8),
+        "surface": _grid(surface).astype(np.float16),
+        "surface_scale": _grid(seen.surface_scale[:, None])[:, 0].astype(np.float16),
+    }
+    confidence = (sure * shots.quality[:, None]).astype(np.float32)
+    columns = Columns(labels.keypoints, px.astype(np.float32), confidence)
+    return columns, Dense(arrays, axis, length), report
+
+
+def from_model(
+    model: ExternalModel, skeleton: Skeleton, labels: Labels, shots: Shots, dense: Dense | None, say: Say
+) -> tuple[Columns, dict[str, Any]]:
+    """What a model of the user's says, its sides decided for the clip."""
+    names = model.mapping.names
+    where = [labels.keypoints.index(n) for n in names]
+    F = len(shots.index)
+    places, sure = np.zeros((F, len(labels.keypoints), 2)), np.zeros((F, len(labels.keypoints)))
+    for f, frame in enumerate(shots.index):
+        places[f, where], sure[f, where] = model(shots.frames[frame], Box(*shots.box[f]))
+        say(f / F)
+    report: dict[str, Any] = {"left_right": {}}
+    axis = dense.axis if dense else np.zeros((F, 3))
+    length = dense.length if dense else 0.5 * shots.box[:, 2]
+    rest = skeleton.rest()
+    for pair in sides.limb_pairs(skeleton, labels):
+        both = np.isin(pair.left, where) & np.isin(pair.right, where)
+        if both.any():
+            some = sides.Pair(pair.name, pair.left[both], pair.right[both], pair.left_parts, pair.right_parts)
+            alone = np.minimum(sure[:, some.left], sure[:, some.right]).sum(1)  # it is more often right than not
+            swapped, report["left_right"][pair.name] = _settle(some, rest, places, sure, alone, axis, length, shots)
+            for x in (places, sure):
+                sides.swap_keypoints(x, some, swapped)
+    return Columns(names, places[:, where].astype(np.float32), sure[:, where].astype(np.float32)), report
+
+
+def from_user(user: UserKeypoints, frame: Array, places: Array, shots: Shots) -> tuple[Columns, dict[str, Any]]:
+    """The user's points at the frames that are looked at; those of frames between are carried along the flow.
+
+    Args:
+        frame: (n,) fractional decoded frames of the points. places: (n, N, 2) px of the decoded frames.
+    """
+    F, N = len(shots.index), len(user.names)
+    out, confidence, unused = np.zeros((F, N, 2), np.float32), np.zeros((F, N), np.float32), 0
+    step = int(np.median(np.diff(shots.index))) if F > 1 else 1
+    nearest = np.abs(shots.index[:, None] - frame).argmin(0)
+    gap = np.abs(shots.index[nearest] - frame)
+    for i in np.argsort(-gap, kind="stable"):  # the nearest last: it stays
+        f = int(nearest[i])
+        if gap[i] > 0.5 * step + 0.5:
+            unused += 1
+            continue
+        said = user.points[i, :, 2] > 0
+        source = int(np.clip(round(float(frame[i])), 0, len(shots.masks) - 1))
+        reach = _REACH * shots.box[f, 2]
+        out[f, said] = shots.motion.carry(places[i, said], source, int(shots.index[f]), reach)
+        confidence[f, said] = user.points[i, said, 2]
+    report = {"frames_given": len(frame), "frames_unused": unused, "points": int((confidence > 0).sum())}
+    return Columns(user.names, out, confidence), report
+
+
+def _settle(
+    pair: sides.Pair, rest: Array, places: Array, sure: Array, alone: Array, axis: Array, length: Array, shots: Shots
+) -> tuple[Array, dict[str, Any]]:  # fmt: skip
+    """(F,) bool, the frames in which a pair's limbs are to be exchanged, and what is said of it.
+
+    Args:
+        rest: (K, 3) of the skeleton. places: (F, K, 2) px. sure: (F, K). alone: (F,) nats that each frame says.
+    """
+    left, right = pair.left, pair.right
+    both = np.stack([places[:, left], places[:, right]], 1)
+    confidence = np.stack([sure[:, left], sure[:, right]], 1)
+    width = rest[pair.left, 1] - rest[pair.right, 1]
+    weight = np.minimum(sure[:, left], sure[:, right])
+    alone = alone + sides.from_view(places[:, left], places[:, right], axis, width, length, weight)
+    together = sides.from_motion(both, shots.carried(both), confidence, shots.box[:, 2], shots.t)
+    swapped, margin = sides.decide(alone * independent(shots.t), together)
+    return swapped, {"swapped_frames": int(swapped.sum()), "margin": margin}
+
+
+def _body_length(labels: Labels, places: Array, sure: Array, view: Array, up: Array, size: int) -> Array:
+    """(F,) px of the crop that a body length takes: how large the trunk is seen, of the size it has from that side."""
+    x = places[:, labels.trunk]
+    weight = sure[:, labels.trunk] + 1e-3
+    weight /= weight.sum(1, keepdims=True)
+    R = rotation_of(CENTRES[view.argmax(1)], up)
+    model = labels.trunk_rest @ np.swapaxes(R, -1, -2)[..., :2]
+    spread = []
+    for y in (x, model):
+        y = y - (weight[..., None] * y).sum(1, keepdims=True)
+        spread.append(np.sqrt((weight * (y**2).sum(-1)).sum(1)))
+    return np.clip(spread[0] / np.maximum(spread[1], 1e-6), 0.3 * size, 0.9 * size)
+
+
+def _grid(x: Array) -> Array:
+    """(F, C, 64, 64) of (F, C, h, w)."""
+    if x.shape[-1] == GRID:
+        return x
+    last = [np.ascontiguousarray(p.transpose(1, 2, 0)) for p in x]
+    small = [cv2.resize(p, (GRID, GRID), interpolation=cv2.INTER_AREA) for p in last]
+    return np.stack([p.reshape(GRID, GRID, -1).transpose(2, 0, 1) for p in small])
