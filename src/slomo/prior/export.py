@@ -3,16 +3,24 @@
 import io
 import json
 import warnings
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 import torch
 
+from slomo.errors import UsageError
 from slomo.prior.inference import METADATA, OUTPUTS
 from slomo.prior.network import CHANNELS, STRIDE, Network
 
 OPSET = 17
 HALVED = 64  # initialisers with fewer numbers stay as they are
+
+
+def require_onnx() -> None:
+    """Raise `UsageError` where the package that writes .onnx files is not installed."""
+    if find_spec("onnx") is None:
+        raise UsageError("training needs the onnx package", where="train", todo="pip install 'slomo[train]'")
 
 
 def onnx_bytes(network: Network, about: dict[str, Any]) -> bytes:

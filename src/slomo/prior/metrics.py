@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from slomo.prior.labels import BINS, rotation_of
+from slomo.prior.labels import BINS, rotation_of, view_of
 
 Array = np.ndarray
 
@@ -15,11 +15,11 @@ FEET = ("_paw", "_toe")
 
 
 def azimuth_of(view: Array) -> Array:
-    """(...,) rad: where probabilities of bins (..., 36) are highest, to fractions of a bin."""
+    """(...,) rad: where probabilities (..., 36) are highest, between bins by the parabola of logarithms."""
     k = view.argmax(-1)
-    near = np.stack([np.take_along_axis(view, ((k + d) % BINS)[..., None], -1)[..., 0] for d in (-1, 0, 1)], -1)
-    shift = (near[..., 2] - near[..., 0]) / np.maximum(near.sum(-1), 1e-9)
-    angle = (k + shift) * (2 * np.pi / BINS)
+    logs = np.log(np.maximum(view, 1e-6))
+    before, at, after = (np.take_along_axis(logs, ((k + d) % BINS)[..., None], -1)[..., 0] for d in (-1, 0, 1))
+    angle = (k + (after - before) / np.maximum(2 * (2 * at - before - after), 1e-6)) * (2 * np.pi / BINS)
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
@@ -35,8 +35,6 @@ def rotation_error(R: Array, true: Array) -> Array:
 
 def view_errors(view: Array, up: Array, true: Array) -> tuple[Array, Array]:
     """Azimuth error and full rotation error (F,) rad. Args: view (F, 36), up (F, 3), true R_view_body (F, 3, 3)."""
-    from slomo.prior.labels import view_of
-
     azimuth = azimuth_of(view)
     return azimuth_error(azimuth, view_of(true)[0]), rotation_error(rotation_of(azimuth, up), true)
 

@@ -24,7 +24,7 @@ from slomo.console import Console
 from slomo.errors import SlomoError, UsageError
 from slomo.prior.augment import AugmentConfig, without
 from slomo.prior.dataset import Batch, Shards, batches, find_shards, fixed, split
-from slomo.prior.export import onnx_bytes
+from slomo.prior.export import onnx_bytes, require_onnx
 from slomo.prior.inference import Prior
 from slomo.prior.labels import Labels, labels
 from slomo.prior.network import STRIDE, Network, NetworkConfig, network
@@ -39,6 +39,7 @@ from slomo.store.files import json_bytes, replace_file
 LOG_EVERY = 25  # steps
 CHECK_EVERY = 500  # steps between looks at samples that are not trained on
 CHECK_BATCHES = 8
+SAVE_EVERY = 60.0  # s
 
 
 @dataclass(frozen=True)
@@ -159,7 +160,9 @@ def train(data: Path, out: Path, config: TrainConfig, progress: Progress) -> Pat
 
     Raises:
         MissingInput, InvalidData: no data set, or a damaged one.
+        UsageError: the package for the export is not installed.
     """
+    require_onnx()
     known = labels(load_skeleton(config.kind))
     paths, listed = find_shards(data / config.kind)
     learned, held_paths = split(paths, held_out=config.held_out)
@@ -191,7 +194,7 @@ def train(data: Path, out: Path, config: TrainConfig, progress: Progress) -> Pat
             losses_now = " ".join(f"{k} {v:.2f}" for k, v in mean.items())
             progress.update(step / config.steps, f"{config.kind}: step {step}, {pace:.0f} samples/s, {losses_now}")
             recent, logged = [], time.monotonic()
-            if time.monotonic() - saved > 60 or last:
+            if time.monotonic() - saved > SAVE_EVERY or last:
                 checkpoints.save(trainer.state(), {"step": step})
                 saved = time.monotonic()
     net = trainer.averaged(known).to(memory_format=torch.contiguous_format)
