@@ -10,10 +10,11 @@ import torch
 from slomo.prior.labels import BINS, labels
 from slomo.reconstruct import evidence_terms, hypotheses, losses, silhouette
 from slomo.reconstruct.evidence import Evidence, gather, nearest
+from slomo.reconstruct.fit import exchanged
 from slomo.reconstruct.hypotheses import GaitHypothesis
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.observations import Observations, observe
-from slomo.reconstruct.problem import Problem, Schedule, optimise
+from slomo.reconstruct.problem import Draw, Problem, Schedule, optimise
 from slomo.reconstruct.silhouette import Intrinsics
 from slomo.reconstruct.trajectory import Guess, Trajectory
 from slomo.skeleton import load_skeleton
@@ -69,7 +70,7 @@ class Scene:
         path = Trajectory(blank.t, KIN.B, joint_hz=4, root_hz=2, width=16)
         self.x, self.true = _variables(path), _guess(phase=0.1)
         pixels = torch.arange(W * H).expand(T, -1)
-        whole = losses_draw(pixels)
+        whole = Draw(torch.arange(T), pixels, 0)
         s = Problem(blank, KIN, path, {}, 0.01).state(self.x, self.true, whole, stance_weight=0.0)
         mask = (s.sd[0].amin(-1) < 0).reshape(T, H, W).numpy()
         self.obs, self.path = _observations(mask), path
@@ -110,12 +111,6 @@ class Scene:
     def value(self, name: str, guess: Guess) -> float:
         problem = self.problem(self.said, {name: 1.0})
         return float(problem.loss(self.x, guess, problem.draw(T, 400, torch.Generator().manual_seed(1)))[0])
-
-
-def losses_draw(pixels: torch.Tensor):
-    from slomo.reconstruct.problem import Draw
-
-    return Draw(torch.arange(len(pixels)), pixels, 0)
 
 
 @pytest.fixture(scope="module")
@@ -189,6 +184,25 @@ def test_key_points_alone_put_swapped_legs_right(scene: Scene):
     true = nodes(scene.x, scene.true)
     before, after = ((n - true).norm(dim=-1).mean() for n in (nodes(scene.x, start), nodes(x, start)))
     assert after < 0.35 * before
+
+
+def test_legs_exchanged_twice_are_as_they_were(scene: Scene):
+    problem, every = scene.problem(None, {}), torch.arange(T)
+    off = {k: v + 0.1 if k.startswith("Q") else v for k, v in scene.x.items()}
+    q = [problem.path(x, g, torch.ones(1), every)[2] for x, g in _exchanges(problem, off, scene.true)]
+    torch.testing.assert_close(q[2], q[0])
+    legs = hypotheses.leg_links(SKELETON)
+    rest = [j for j in range(KIN.B) if j not in legs]
+    torch.testing.assert_close(q[1][:, :, rest], q[0][:, :, rest])
+    left, right = (SKELETON.names.index(f"hind_{side}_knee") for side in ("left", "right"))
+    torch.testing.assert_close(q[1][:, :, left, 1], q[0][:, :, right, 1])
+
+
+def _exchanges(problem: Problem, x: dict[str, torch.Tensor], guess: Guess) -> list[tuple[dict, Guess]]:
+    out = [(x, guess)]
+    for _ in range(2):
+        out.append(exchanged(problem, *out[-1]))
+    return out
 
 
 @pytest.mark.parametrize("empty", [{}, {"frame": np.zeros(0, int), "keypoint_names": np.zeros(0, "<U1")}])

@@ -102,6 +102,8 @@ def test_a_walk_is_found(walk):
     assert report["hypothesis"]["gait"] == "walk"
     assert report["silhouette_iou"] > 0.8
     assert report["scale_source"] == "typical length of quadruped"
+    assert report["swap_margin"] is not None
+    assert report["evidence"] == []
     motion = KeypointMotion.from_arrays(out.npz["keypoints.npz"])
     names = load_skeleton("quadruped").names
     Y = true[:, [names.index(n) for n in motion.names]]

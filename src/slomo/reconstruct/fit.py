@@ -4,9 +4,8 @@ Every phase is one `optimise` of a batch of hypotheses; between phases they are 
 best go on. All of it is deterministic by the seed, and a checkpoint within any phase resumes to the same bits.
 """
 
-import json
 import math
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -14,28 +13,13 @@ import torch
 from slomo.reconstruct import hypotheses, pose_track
 from slomo.reconstruct.hypotheses import GaitHypothesis, RootGuess
 from slomo.reconstruct.problem import Problem, Schedule, Variables, optimise
+from slomo.reconstruct.run import Run, checkpoint, join, restore
 from slomo.reconstruct.trajectory import Guess
-from slomo.stage import Arrays, Progress
+from slomo.stage import Progress
 
 Tensor = torch.Tensor
 
 PHASES = ("heading", "gait", "rivals", "final")
-
-
-@dataclass
-class Run:
-    """Where a fit stands; all of it is in a checkpoint.
-
-    Attributes:
-        phase: index into PHASES. x, guess: of its H hypotheses. labels: what each hypothesis is.
-        log: what was decided so far, for the report.
-    """
-
-    phase: int
-    x: Variables
-    guess: Guess
-    labels: list[dict]
-    log: dict = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -55,7 +39,7 @@ def fit(problem: Problem, root: RootGuess, effort: Effort, *, metres: float, see
         seed: of the draws and of the MLPs' first layers.
     """
     generator = torch.Generator().manual_seed(seed)
-    run, start, adam_state = _restore(progress.load(), generator)
+    run, start, adam_state = restore(progress.load(), generator)
     if run is None:
         run = _start(problem, root, generator)
     total = total_cost(effort)
@@ -67,7 +51,7 @@ def fit(problem: Problem, root: RootGuess, effort: Effort, *, metres: float, see
             fraction = (done + i * _cost(schedule)) / total
             progress.update(fraction, f"{PHASES[run.phase]} {i}/{schedule.iterations}, loss {float(loss.min()):.3f}")
             if progress.checkpoint_due():
-                progress.save(_arrays(run, i, optimiser, generator))
+                progress.save(checkpoint(run, i, optimiser, generator))
 
         run.x = optimise(
             problem, run.x, run.guess, schedule, generator, start=start, adam_state=adam_state, each=each
@@ -114,7 +98,7 @@ def _start(problem: Problem, root: RootGuess, generator: torch.Generator) -> Run
     best = torch.stack([v for v, _, _ in tried]).argmin(0).tolist()
     x = _pick(one, torch.zeros(len(best), dtype=torch.long))
     x["shape.log_length"] += torch.tensor([math.log(root.length * sizes[b]) for b in best])
-    return Run(0, x, _join([tried[b][1][k] for k, b in enumerate(best)]), [tried[b][2][k] for k, b in enumerate(best)])
+    return Run(0, x, join([tried[b][1][k] for k, b in enumerate(best)]), [tried[b][2][k] for k, b in enumerate(best)])
 
 
 def _start_tracked(problem: Problem, root: RootGuess, generator: torch.Generator) -> Run:
@@ -146,7 +130,7 @@ def _start_tracked(problem: Problem, root: RootGuess, generator: torch.Generator
             lengths.append(math.log(scaled.length))
     x = _pick(one, torch.zeros(len(guesses), dtype=torch.long))
     x["shape.log_length"] += torch.tensor(lengths)
-    return Run(0, x, _join(guesses), labels)
+    return Run(0, x, join(guesses), labels)
 
 
 def total_cost(effort: Effort) -> float:
@@ -220,7 +204,7 @@ def _to_gait(
         run.labels[k] | {"gait": g.name, "stride_hz": round(g.frequency, 3), "phase": round(g.phase, 3)}
         for _, k, g, _ in chosen
     ]
-    return Run(1, _pick(run.x, which), _join(guesses), labels, run.log)
+    return Run(1, _pick(run.x, which), join(guesses), labels, run.log)
 
 
 def _lay(base: Guess, poses: list[tuple[np.ndarray, np.ndarray]]) -> Guess:
@@ -228,10 +212,6 @@ def _lay(base: Guess, poses: list[tuple[np.ndarray, np.ndarray]]) -> Guess:
     n = len(poses)
     wide = base.pick(torch.zeros(n, dtype=torch.long))
     return replace(wide, q=base.q + f([q for q, _ in poses]), stance=f([c for _, c in poses]))
-
-
-def _join(guesses: list[Guess]) -> Guess:
-    return Guess(**{f.name: torch.cat([getattr(g, f.name) for g in guesses]) for f in fields(Guess)})
 
 
 def _diverse(entries: list, count: int) -> list:
@@ -261,55 +241,30 @@ def _diverse(entries: list, count: int) -> list:
 
 
 def _to_rivals(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
-    """The two best go on."""
+    """The two best go on, and the best one with its left and right legs exchanged: the silhouette hardly tells them
+    apart, and none of the others need be its opposite."""
     which = losses.argsort()[:2]
-    return Run(2, _pick(run.x, which), run.guess.pick(which), [run.labels[int(k)] for k in which], run.log)
+    best = which[:1]
+    x, guess = _pick(run.x, which), run.guess.pick(which)
+    opposite = exchanged(problem, _pick(run.x, best), run.guess.pick(best))
+    x = {k: torch.cat([v, opposite[0][k]]) for k, v in x.items()}
+    labels = [run.labels[int(k)] for k in which]
+    return Run(2, x, join([guess, opposite[1]]), [*labels, labels[0] | {"legs": "exchanged"}], run.log)
+
+
+def exchanged(problem: Problem, x: Variables, guess: Guess) -> tuple[Variables, Guess]:
+    """The same motion with the joint angles of left and right legs exchanged, as a guess with no corrections to it."""
+    kin, T = problem.kin, len(problem.obs.t)
+    with torch.no_grad():
+        _, _, q = problem.path(x, guess, x["shape.log_length"].exp(), torch.arange(T))
+    legs = torch.tensor(hypotheses.leg_links(kin.skeleton))
+    mirrored = q.clone()
+    mirrored[:, :, legs] = q[:, :, kin.mirror[legs]] * torch.tensor([-1.0, 1.0, -1.0])
+    last = max(k for k in x if k.startswith("Q.w")).removeprefix("Q.w")
+    x = x | {k: torch.zeros_like(x[k]) for k in (f"Q.w{last}", f"Q.b{last}")}
+    return x, replace(guess, q=mirrored, stance=torch.full_like(guess.stance, -1.0))
 
 
 def _to_final(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
     which = losses.argsort()[:1]
     return Run(3, _pick(run.x, which), run.guess.pick(which), [run.labels[int(which)]], run.log)
-
-
-def swap_margin(log: dict) -> float | None:
-    """Relative loss by which the chosen gait beats its left-right opposite after the short fits; None without one."""
-    chosen = log["final"][0]
-    if chosen.get("gait", "none") == "none":
-        return None
-    own = next(e for e in log["gait"] if all(e.get(k) == v for k, v in chosen.items() if k != "loss"))
-    other = [
-        e["loss"] for e in log["gait"]
-        if e["gait"] == own["gait"] and abs(abs(e["phase"] - own["phase"]) - 0.5) < 0.13
-        and abs(e["stride_hz"] / own["stride_hz"] - 1) < 0.15
-    ]  # fmt: skip
-    return round(min(other) / own["loss"] - 1, 4) if other else None
-
-
-def _arrays(run: Run, iteration: int, optimiser: torch.optim.Adam, generator: torch.Generator) -> dict[str, np.ndarray]:
-    """A checkpoint."""
-    out = {f"x.{k}": v.detach().numpy().copy() for k, v in run.x.items()}
-    out |= {f"guess.{f.name}": getattr(run.guess, f.name).numpy() for f in fields(Guess)}
-    for n, s in optimiser.state_dict()["state"].items():
-        out |= {f"adam.{n}.{k}": v.numpy().copy() for k, v in s.items()}
-    meta = dict(phase=run.phase, iteration=iteration, labels=run.labels, log=run.log)
-    out["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
-    out["rng"] = generator.get_state().numpy()
-    return out
-
-
-def _restore(saved: Arrays | None, generator: torch.Generator) -> tuple[Run | None, int, dict | None]:
-    """Run, iteration and Adam's moments from a checkpoint; the generator is set to where it was."""
-    if saved is None:
-        return None, 0, None
-    z = {k: np.array(v) for k, v in saved.items()}
-    tensor = lambda a: torch.from_numpy(a.copy())  # noqa: E731
-    meta = json.loads(bytes(z["meta"]))
-    x = {k[2:]: tensor(v) for k, v in z.items() if k.startswith("x.")}
-    guess = Guess(**{f.name: tensor(z[f"guess.{f.name}"]) for f in fields(Guess)})
-    generator.set_state(tensor(z["rng"]))
-    state: dict[int, dict] = {}
-    for k, v in z.items():
-        if k.startswith("adam."):
-            _, n, name = k.split(".")
-            state.setdefault(int(n), {})[name] = tensor(v)
-    return Run(meta["phase"], x, guess, meta["labels"], meta["log"]), meta["iteration"], state

@@ -152,6 +152,17 @@ def posture_angles(kin: Kinematics) -> tuple[Tensor, list[str]]:
     return torch.stack(angles), names
 
 
+def leg_links(skeleton: Skeleton) -> list[int]:
+    """The links of all legs: from the joint that swings one to its contact."""
+    out = set()
+    for limb in skeleton.limbs:
+        node = int(skeleton.link[limb.contact])
+        while node != skeleton.link[limb.swing] and node > 0:
+            out.add(node)
+            node = int(skeleton.link[node])
+    return sorted(out)
+
+
 def stride_frequencies(obs: Observations, low: float, high: float) -> list[float]:
     """Candidate stride frequencies Hz from the self-similarity of the leg band, most likely first.
 

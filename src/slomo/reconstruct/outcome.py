@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from slomo.reconstruct import fit as fitting
 from slomo.reconstruct import losses, silhouette
 from slomo.reconstruct.kinematics import Posed
 from slomo.reconstruct.problem import Draw, Problem
+from slomo.reconstruct.run import Run
 
 Array = np.ndarray
 
@@ -29,7 +29,7 @@ class Outcome:
     report: dict[str, Any]
 
 
-def assess(problem: Problem, run: fitting.Run, metres: float) -> Outcome:
+def assess(problem: Problem, run: Run, metres: float) -> Outcome:
     """Evaluate the winner at every frame and scale it so that its body is `metres` long."""
     obs, kin = problem.obs, problem.kin
     skeleton = kin.skeleton
@@ -57,7 +57,7 @@ def assess(problem: Problem, run: fitting.Run, metres: float) -> Outcome:
         "silhouette_iou": round(iou, 4),
         "flow_residual_px": round(error, 3),
         "hypothesis": run.labels[0],
-        "swap_margin": fitting.swap_margin(run.log),
+        "swap_margin": _swap_margin(run.log),
         "margin": _margin(run.log),
         "search": run.log,
         "foot_skate_mps": round(_skate(feet, contact, obs.t.numpy()), 4),
@@ -71,9 +71,32 @@ def assess(problem: Problem, run: fitting.Run, metres: float) -> Outcome:
 
 
 def _margin(log: dict) -> float | None:
-    """Relative loss by which the winner beat the runner-up in the rivals phase."""
+    """Relative loss by which the winner beat the runner-up among the rivals."""
     rivals = sorted(e["loss"] for e in log["rivals"])
     return round(rivals[1] / rivals[0] - 1, 4) if len(rivals) > 1 else None
+
+
+def _swap_margin(log: dict) -> float | None:
+    """Relative loss by which the winner beats its left-right opposite: among the rivals, else (where the opposite of
+    another one was there) of its gait after the short fits; None where neither was compared."""
+    chosen = _named(log["final"][0])
+    rivals = [(_named(e), e["loss"]) for e in log["rivals"]]
+    own = next(loss for name, loss in rivals if name == chosen)
+    flip = {k: v for k, v in chosen.items() if k != "legs"} | ({} if "legs" in chosen else {"legs": "exchanged"})
+    other = [loss for name, loss in rivals if name == flip]
+    if not other and chosen.get("gait", "none") != "none":
+        own = next(e["loss"] for e in log["gait"] if _named(e) == chosen)
+        other = [
+            e["loss"] for e in log["gait"]
+            if e["gait"] == chosen["gait"] and abs(abs(e["phase"] - chosen["phase"]) - 0.5) < 0.13
+            and abs(e["stride_hz"] / chosen["stride_hz"] - 1) < 0.15
+        ]  # fmt: skip
+    return round(min(other) / own - 1, 4) if other else None
+
+
+def _named(entry: dict) -> dict:
+    """What a hypothesis in the log is, without its loss."""
+    return {k: v for k, v in entry.items() if k != "loss"}
 
 
 def _own_length(problem: Problem, shape: dict[str, torch.Tensor]) -> float:
@@ -105,7 +128,7 @@ def _skate(feet: Array, contact: Array, t: Array) -> float:
     return float(v[stands].mean()) if stands.any() else 0.0
 
 
-def _overlap(problem: Problem, run: fitting.Run) -> tuple[float, float, Array]:
+def _overlap(problem: Problem, run: Run) -> tuple[float, float, Array]:
     """Silhouette IoU over all fit frames, median flow error in decoded pixels, and IoU of each fit frame (F,)."""
     obs = problem.obs
     ious, errors = [], []

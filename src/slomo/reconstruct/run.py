@@ -1,0 +1,67 @@
+"""Where a fit stands between two iterations, and its checkpoint."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+import torch
+
+from slomo.reconstruct.problem import Variables
+from slomo.reconstruct.trajectory import Guess
+from slomo.stage import Arrays
+
+Tensor = torch.Tensor
+
+
+@dataclass
+class Run:
+    """Where a fit stands; all of it is in a checkpoint.
+
+    Attributes:
+        phase: index into `fit.PHASES`. x, guess: of its H hypotheses. labels: what each hypothesis is.
+        log: what was decided so far, for the report.
+    """
+
+    phase: int
+    x: Variables
+    guess: Guess
+    labels: list[dict]
+    log: dict = field(default_factory=dict)
+
+
+def join(guesses: Sequence[Guess]) -> Guess:
+    """The hypotheses of several guesses as one."""
+    return Guess(**{f.name: torch.cat([getattr(g, f.name) for g in guesses]) for f in fields(Guess)})
+
+
+def checkpoint(
+    run: Run, iteration: int, optimiser: torch.optim.Adam, generator: torch.Generator
+) -> dict[str, np.ndarray]:
+    """Everything that `restore` needs to go on to the same bits."""
+    out = {f"x.{k}": v.detach().numpy().copy() for k, v in run.x.items()}
+    out |= {f"guess.{f.name}": getattr(run.guess, f.name).numpy() for f in fields(Guess)}
+    for n, s in optimiser.state_dict()["state"].items():
+        out |= {f"adam.{n}.{k}": v.numpy().copy() for k, v in s.items()}
+    meta = dict(phase=run.phase, iteration=iteration, labels=run.labels, log=run.log)
+    out["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
+    out["rng"] = generator.get_state().numpy()
+    return out
+
+
+def restore(saved: Arrays | None, generator: torch.Generator) -> tuple[Run | None, int, dict | None]:
+    """Run, iteration and Adam's moments from a checkpoint; the generator is set to where it was."""
+    if saved is None:
+        return None, 0, None
+    z = {k: np.array(v) for k, v in saved.items()}
+    tensor = lambda a: torch.from_numpy(a.copy())  # noqa: E731
+    meta = json.loads(bytes(z["meta"]))
+    x = {k[2:]: tensor(v) for k, v in z.items() if k.startswith("x.")}
+    guess = Guess(**{f.name: tensor(z[f"guess.{f.name}"]) for f in fields(Guess)})
+    generator.set_state(tensor(z["rng"]))
+    state: dict[int, dict] = {}
+    for k, v in z.items():
+        if k.startswith("adam."):
+            _, n, name = k.split(".")
+            state.setdefault(int(n), {})[name] = tensor(v)
+    return Run(meta["phase"], x, guess, meta["labels"], meta["log"]), meta["iteration"], state
