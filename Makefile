@@ -1,11 +1,16 @@
 # make demo   sets up .venv, turns the embedded clip into a robot's motion, ends with pictures and numbers
 # make test   unit tests and an end-to-end smoke test     make check  ruff and pyright
+# make train-prior   pictures, then the networks of src/slomo/prior/weights, from nothing: within the hour on two cores
+# make bench-prior   those networks alone against truth      (WEIGHTS=folder: others; BENCH="--truth ... --masks ...")
 PYTHON ?= python3
 ROBOT  ?= go1
 DEMO   := demo
 CLIP   := src/slomo/assets/walk
+KINDS  := quadruped human
+PRIOR  := prior-training
+SHIPPED := src/slomo/prior/weights
 
-.PHONY: demo test slow check clean
+.PHONY: demo test slow check clean train-prior bench-prior $(KINDS:%=train-%)
 .DELETE_ON_ERROR:
 
 demo: .venv/run.stamp
@@ -21,6 +26,20 @@ check: .venv/dev.stamp
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/pyright
+
+# One kind a core; stopped at any time, the same command goes on.
+train-prior: .venv/dev.stamp
+	$(MAKE) --jobs=2 $(KINDS:%=train-%)
+	mkdir -p $(SHIPPED)
+	cp $(foreach kind,$(KINDS),$(PRIOR)/$(kind).onnx $(PRIOR)/$(kind).json $(PRIOR)/$(kind).csv) $(SHIPPED)
+	$(foreach kind,$(KINDS),cp $(PRIOR)/$(kind).png docs/training-$(kind).png;)
+
+$(KINDS:%=train-%): train-%: .venv/dev.stamp
+	.venv/bin/slomo dataset $(PRIOR)/data --kind $* --samples 9600
+	OMP_NUM_THREADS=1 .venv/bin/python -m slomo.prior.train $(PRIOR)/data $(PRIOR) --kind $*
+
+bench-prior: .venv/dev.stamp
+	OMP_NUM_THREADS=1 .venv/bin/python tests/bench_prior.py $(if $(WEIGHTS),--weights $(WEIGHTS)) $(BENCH)
 
 .venv/run.stamp: pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "slomo needs Python 3.11 or newer: make PYTHON=python3.11")'
