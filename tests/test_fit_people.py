@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from slomo.prior.labels import BINS
 from slomo.reconstruct import hypotheses, losses, pose_track, silhouette
+from slomo.reconstruct.evidence import gather
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.observations import observe
 from slomo.reconstruct.problem import Problem
@@ -80,6 +82,17 @@ def test_a_person_is_seen_from_the_front_unless_asked_otherwise(raising):
     assert _away(_track(*raising).yaw, TOWARDS_CAMERA).max() < 46
     behind = _track(*raising, views=(-pose_track.AWAY,))
     assert _away(behind.yaw, -TOWARDS_CAMERA).max() < 46
+
+
+@pytest.mark.parametrize("azimuth", [0.0, np.pi])
+def test_the_view_decides_between_front_and_back(raising, azimuth: float):
+    problem, root = raising
+    apart = (2 * np.pi * np.arange(BINS) / BINS - azimuth + np.pi) % (2 * np.pi) - np.pi
+    view = np.exp(-0.5 * (apart / 0.3) ** 2)
+    view = 0.8 * view / view.sum() + 0.2 / BINS
+    arrays = dict(frame=np.arange(T), view=np.tile(view, (T, 1)), view_path=np.full(T, azimuth))
+    track = _track(problem, root, views=(gather(arrays, problem.obs, problem.kin.skeleton),))
+    assert _away(track.yaw, TOWARDS_CAMERA - azimuth).max() < 46
 
 
 def test_a_turn_to_the_side_is_followed():

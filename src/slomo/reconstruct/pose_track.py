@@ -112,7 +112,7 @@ def tracks(
 
 def _view_cost(view: View, yaw: Array, to_camera: Array, seen: Tensor) -> Array:
     """(N, S) cost of the headings yaw (N, S) of the fit frames `seen` with the camera in direction to_camera (S,)."""
-    if isinstance(view, float):
+    if not isinstance(view, Evidence):
         return view * np.maximum(-np.cos(yaw - to_camera), 0)
     azimuth = torch.as_tensor(to_camera - yaw, dtype=torch.float32)
     cost = evidence_terms.at_azimuth(evidence_terms.doubtful(view.view[seen]), azimuth)
