@@ -129,11 +129,14 @@ def test_points_ride_on_the_subject_s_flow():
         masks[f, 10:30, 10 + 2 * f : 20 + 2 * f] = True
         if f < 3:
             flow[f][masks[f]] = (2, 0)
-    motion = Motion(flow, masks)
+    motion = Motion(flow, masks, np.arange(4) / 30)
     points = np.array([[15.0, 20.0], [10.0, 12.0]])  # in the middle, and on the very edge
     assert np.abs(motion.carry(points, 0, 3, 2.0) - points - [6, 0]).max() < 0.02
     assert np.abs(motion.carry(points + [6, 0], 3, 0, 2.0) - points).max() < 0.5
     assert np.array_equal(motion.carry(points, 2, 2, 2.0), points)
+    longer = Motion(np.concatenate([flow] * 5), np.concatenate([masks] * 5), np.arange(16) / 30)
+    assert np.allclose(longer.at(0)[20, 15], [4, 0])  # a fifteenth of a second is two frames
+    assert longer.at(15).shape == (40, 60, 2)
 
 
 class Walk:
@@ -173,7 +176,7 @@ class Walk:
             flow[f] = moved.reshape(32, 32, 2).repeat(4, 0).repeat(4, 1)
         masks = np.ones((F, 128, 128), bool)
         frames_rgb = np.zeros((F, 128, 128, 3), np.uint8)
-        self.shots = Shots(np.arange(F), t, box, np.ones(F), frames_rgb, masks, Motion(flow, masks))
+        self.shots = Shots(np.arange(F), t, box, np.ones(F), frames_rgb, masks, Motion(flow, masks, t))
 
     def __call__(self, crops):
         F = len(self.places)

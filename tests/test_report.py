@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from slomo.formats.mp4 import encode_mp4
 from slomo.motion import KeypointMotion, Reference, Rollout
 from slomo.report import meshes, stage, table
+from slomo.report.evidence import evidence_picture
 from slomo.report.panels import KeypointPanel, RobotPanel, bones, heading
 from slomo.report.plots import foot_heights
 from slomo.report.video import Composer, FootFalls
@@ -106,6 +107,33 @@ def test_the_whole_report(artifacts, robot):
     assert report["reconstruction"]["pa_mpjpe_percent"] < 1e-6
     assert {r["quantity"] for r in report["rows"]} >= {"penetration", "fell", "scale, robot over creature"}
     assert "at most 0.001" in report["text"]
+
+
+def test_what_was_seen_is_in_the_report(artifacts, robot):
+    names = np.array(["nose", "withers", "front_left_paw", "nose"])
+    F = 3
+    parts = np.zeros((F, 4, 64, 64), np.uint8)
+    parts[:, 0], parts[:, 0, 16:48, 16:48], parts[:, 2, 16:48, 16:48] = 255, 0, 255  # all of it a left leg
+    evidence = {
+        "frame": np.array([0, 4, 8]), "box": np.tile(np.float32([2, 3, 30]), (F, 1)),
+        "view_path": np.zeros(F, np.float32), "view_up": np.tile(np.float32([0, -1, 0]), (F, 1)),
+        "keypoint_names": names, "keypoints": np.full((F, 4, 2), 17.0, np.float32),
+        "keypoint_confidence": np.tile(np.float32([0.9, 0.0, 0.5, 1.0]), (F, 1)),
+        "part_names": np.array(["trunk", "front_left", "front_right"]), "parts": parts,
+    }  # fmt: skip
+    said = artifacts | {"evidence": Artifact(npz={"evidence.npz": evidence})}
+    data = stage.run(Inputs(said, {}, robot), stage.Config(fps=5, moments=2), Silent()).blobs["evidence.png"]
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(float)
+    assert picture.shape == (26 + 2 * (256 + 6), 3 * (256 + 6) + 6, 3)
+    below = picture[26 + 256 + 6 :][:256, 6 : 6 + 256]
+    leg, around = below[80:110, 80:110].mean((0, 1)), below[10:50, 10:50].mean((0, 1))
+    assert leg[0] > leg[2] + 60  # warm
+    assert np.ptp(around) < 5
+    silent = {k: v[:0] if k not in ("keypoint_names", "part_names") else v for k, v in evidence.items()}
+    frames = artifacts["decode"].npz["frames.npz"]
+    assert evidence_picture(silent, frames["frames"], frames["t"]) is None
+    only_points = evidence | {k: evidence[k][:0] for k in ("parts", "view_path", "view_up")}
+    assert evidence_picture(only_points, frames["frames"], frames["t"])
 
 
 def test_video_is_h264_with_one_frame_for_each_time(tmp_path, artifacts, robot):

@@ -1,8 +1,11 @@
 """Which frames the networks see, and places carried from one frame to another along the optical flow."""
 
+import cv2
 import numpy as np
 
 Array = np.ndarray
+
+SPAN = 1 / 15  # s between the two pictures whose motion the networks see; less is little more than noise
 
 _AROUND = np.stack(np.meshgrid([-1, -0.5, 0, 0.5, 1], [-1, -0.5, 0, 0.5, 1]), -1).reshape(-1, 2)
 
@@ -18,17 +21,24 @@ class Motion:
     """The subject's motion in the picture.
 
     Args:
-        flow: (T-1, H, W, 2) px, frame t -> t+1. masks: (T, H, W) bool.
+        flow: (T-1, H, W, 2) px, frame t -> t+1. masks: (T, H, W) bool. t: (T,) s.
     """
 
-    def __init__(self, flow: Array, masks: Array):
+    def __init__(self, flow: Array, masks: Array, t: Array):
         self._flow, self._masks = flow, masks
+        self._apart = every(t, 1 / SPAN)
 
-    def at(self, frame: int) -> Array | None:
-        """(H, W, 2) float32 px from the frame to the next; of the last one, what came before; None for a lone frame."""
-        if not len(self._flow):
-            return None
-        return np.asarray(self._flow[min(frame, len(self._flow) - 1)], np.float32)
+    def at(self, frame: int) -> Array:
+        """(H, W, 2) float32 px from the frame to about `SPAN` later; of the last frames, what came before."""
+        first = max(0, min(frame, len(self._flow) - self._apart))
+        total = np.array(self._flow[first], np.float32)
+        h, w = total.shape[:2]
+        x, y = np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32))
+        for f in range(first + 1, min(first + self._apart, len(self._flow))):
+            step = np.asarray(self._flow[f], np.float32)
+            there = x + total[..., 0], y + total[..., 1]
+            total += cv2.remap(step, *there, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return total
 
     def carry(self, points: Array, source: int, target: int, reach: float) -> Array:
         """(N, 2) px in frame `target` of the points (N, 2) px of frame `source`, before or after it.

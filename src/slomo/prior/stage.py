@@ -146,7 +146,7 @@ def _shots(inputs: Inputs, fps: float) -> Shots:
         quality=np.asarray(packed["quality"], float)[index],
         frames=decode["frames"],
         masks=full,
-        motion=Motion(masks["flow.npz"]["flow"], full),
+        motion=Motion(masks["flow.npz"]["flow"], full, t),
     )
 
 

@@ -10,6 +10,7 @@ from slomo.formats.mp4 import encode_mp4
 from slomo.motion import KeypointMotion, Reference, Rollout
 from slomo.pointfoot import GRAVITY, PointFootModel
 from slomo.report import table
+from slomo.report.evidence import evidence_picture
 from slomo.report.panels import ClipPanel, KeypointPanel, Panel, ReferencePanel, RobotPanel, heading
 from slomo.report.plots import foot_heights
 from slomo.report.video import Composer, FootFalls, contact_sheet, draw_all, png
@@ -17,7 +18,7 @@ from slomo.stage import Arrays, Artifact, Inputs, Progress
 from slomo.synth.score import score
 from slomo.terrain import Terrain
 
-VERSION = 3
+VERSION = 4
 
 
 @dataclass(frozen=True)
@@ -34,10 +35,11 @@ class Config:
 
 
 def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
-    """`side_by_side.mp4`, `side_by_side.png`, `foot_heights.png` and `report.json`.
+    """`side_by_side.mp4`, `side_by_side.png`, `foot_heights.png`, `evidence.png` and `report.json`.
 
-    Takes the artifacts of the whole line; "decode" and "reconstruct" are absent when key points were imported, and then
-    the video has no panel of a clip. With a `truth.npz` in `inputs.files["truth"]` the reconstruction is scored.
+    Takes the artifacts of the whole line; "decode", "evidence" and "reconstruct" are absent when key points were
+    imported, and then the video has no panel of a clip. `evidence.png` is left out where nobody said anything about the
+    clip. With a `truth.npz` in `inputs.files["truth"]` the reconstruction is scored.
 
     Raises:
         UsageError: a parameter out of range.
@@ -97,6 +99,10 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     for line in report["text"].splitlines():
         progress.note(line)
     blobs = {"side_by_side.mp4": video, "side_by_side.png": png(sheet), "foot_heights.png": heights}
+    if "evidence" in artifacts:
+        frames = artifacts["decode"].npz["frames.npz"]
+        seen = evidence_picture(artifacts["evidence"].npz["evidence.npz"], frames["frames"], frames["t"])
+        blobs |= {"evidence.png": seen} if seen else {}
     return Artifact(json={"report.json": report}, blobs=blobs)
 
 

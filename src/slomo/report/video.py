@@ -138,6 +138,19 @@ def contact_sheet(titles: Sequence[str], times: np.ndarray, pictures: Sequence[S
     return np.asarray(canvas)
 
 
+def sheet(columns: Sequence[Sequence[np.ndarray]], captions: Sequence[str]) -> np.ndarray:
+    """Pictures of equal size (H, W, 3), one column below its caption for each moment."""
+    h, w = columns[0][0].shape[:2]
+    width, height = len(columns) * (w + GAP) + GAP, CAPTION + len(columns[0]) * (h + GAP)
+    canvas = Image.new("RGB", (width, height), BACKGROUND)
+    for i, (pictures, text) in enumerate(zip(columns, captions, strict=True)):
+        x = GAP + i * (w + GAP)
+        _text(canvas, (x + w / 2, CAPTION / 2), text, anchor="mm")
+        for j, picture in enumerate(pictures):
+            canvas.paste(Image.fromarray(picture), (x, CAPTION + j * (h + GAP)))
+    return np.asarray(canvas)
+
+
 def png(picture: np.ndarray) -> bytes:
     """PNG file of (H, W, 3) uint8 RGB."""
     ok, data = cv2.imencode(".png", picture[..., ::-1])
