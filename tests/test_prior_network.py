@@ -16,7 +16,8 @@ from slomo.prior.export import onnx_bytes
 from slomo.prior.inference import OUTPUTS, Prior
 from slomo.prior.labels import BINS, labels, rotation_of, view_of
 from slomo.prior.network import Network, NetworkConfig, Output, network
-from slomo.prior.train import TrainConfig, Trainer, train
+from slomo.prior.train import train
+from slomo.prior.trainer import TrainConfig, Trainer
 from slomo.skeleton import load_skeleton
 from slomo.stage import Silent
 

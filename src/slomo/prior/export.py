@@ -45,7 +45,7 @@ def onnx_bytes(network: Network, about: dict[str, Any]) -> bytes:
         torch.onnx.export(
             network,
             (torch.zeros(2, CHANNELS, 4 * STRIDE, 4 * STRIDE),),
-            out,
+            out,  # pyright: ignore[reportArgumentType]
             input_names=["input"],
             output_names=list(OUTPUTS),
             dynamic_axes=sides,

@@ -124,5 +124,6 @@ class Network(nn.Module):
 
 
 def network(labels: Labels, config: NetworkConfig | None = None) -> Network:
-    """The network of one kind of body."""
-    return Network(len(labels.keypoints), len(labels.parts), config)
+    """The network of one kind of body, its weights laid out channels last, which convolutions on a CPU like."""
+    made = Network(len(labels.keypoints), len(labels.parts), config)
+    return made.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
