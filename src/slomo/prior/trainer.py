@@ -30,7 +30,7 @@ class TrainConfig:
     """
 
     kind: str = "quadruped"
-    steps: int = 4500
+    steps: int = 4000
     batch: int = 32
     size: int = 128
     seed: int = 0
