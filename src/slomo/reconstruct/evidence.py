@@ -36,8 +36,9 @@ class Evidence:
         view_weight: (F,). path: (F,) rad, azimuth decided over the whole clip; NaN without a view.
         trunk: nodes whose middle is what the camera is turned to.
         node: (N,) the node each key point column speaks of. uv: (F, N, 2) px. confidence: (F, N) in [0, 1].
-        box: (F, 3) left and top edge and side px of the grid. parts: (F, P + 1, S, S) uint8, probability * 255.
-        parts_weight: (F,). part_capsules: of each of P parts, the capsules.
+        box: (F, 3) left and top edge and side px of the grid of parts. part: (F, S, S, 2) the two likeliest parts, and
+            chance: (F, S, S, 2) their probabilities. parts_weight: (F,). part_capsules: (P, k) capsules of each part,
+            those of a part with fewer than k repeated.
         seen: (F, M, 2) px that see the surface points on capsule (F, M) at (F, M) along its axis in the direction
             normal (F, M, 3) of its link. sure: (F, M) in [0, 1].
     """
@@ -52,9 +53,10 @@ class Evidence:
     uv: Tensor
     confidence: Tensor
     box: Tensor
-    parts: Tensor
+    part: Tensor
+    chance: Tensor
     parts_weight: Tensor
-    part_capsules: tuple[tuple[int, ...], ...]
+    part_capsules: Tensor
     seen: Tensor
     capsule: Tensor
     along: Tensor
@@ -132,10 +134,7 @@ def gather(arrays: Mapping[str, Array], obs: Observations, skeleton: Skeleton) -
         view_weight=f(has_view) * obs.quality, path=_filled(path, has_view & has_path),
         trunk=torch.as_tensor(known.trunk), node=node, uv=f(uv), confidence=f(confidence),
         box=f(np.where(has_parts[:, None], box * obs.scale, 1.0)),
-        parts=torch.as_tensor(np.ascontiguousarray(parts), dtype=torch.uint8), parts_weight=f(has_parts) * obs.quality,
-        part_capsules=tuple(
-            tuple(np.flatnonzero(known.capsule_part == p + 1).tolist()) for p in range(len(known.parts))
-        ),
+        **_likeliest(parts), parts_weight=f(has_parts) * obs.quality, part_capsules=_capsules(known),
         **points,
     )  # fmt: skip
 
@@ -168,6 +167,17 @@ def _ordered(parts: Array, arrays: Mapping[str, Array], known: Labels) -> Array:
         if name in names:
             out[:, n + 1] = parts[:, names.index(name) + 1]
     return out
+
+
+def _likeliest(parts: Array) -> dict[str, Tensor]:
+    """The two likeliest parts of each cell, from uint8 probabilities (F, P + 1, S, S): left and right, mostly."""
+    chance, part = torch.as_tensor(np.ascontiguousarray(parts[:, 1:].transpose(0, 2, 3, 1))).topk(2, -1)
+    return dict(part=part, chance=chance.float() / 255)
+
+
+def _capsules(known: Labels) -> Tensor:
+    each = [np.flatnonzero(known.capsule_part == p + 1) for p in range(len(known.parts))]
+    return torch.as_tensor(np.stack([np.resize(c, max(map(len, each))) for c in each]))
 
 
 def _surface(

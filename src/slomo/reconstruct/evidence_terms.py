@@ -91,12 +91,13 @@ def _distance(e: Evidence, s: State, X: Tensor, uv: Tensor, weight: Tensor) -> T
 
 def parts(e: Evidence, s: State) -> Tensor:
     """Pixels of the mask against the body part that they are said to show: how far they are from its capsules."""
-    n, S = s.inside, e.parts.shape[-1]
+    n, S = s.inside, e.part.shape[1]
     x0, y0, side = e.box[s.seen][..., None].unbind(1)
     column = ((s.u[:, :n] + 0.5 - x0) * (S / side)).long().clamp(0, S - 1)
     row = ((s.v[:, :n] + 0.5 - y0) * (S / side)).long().clamp(0, S - 1)
-    p = e.parts[s.seen[:, None], :, row, column].float() / 255
-    sd = s.sd[:, :, :n]
-    near = torch.stack([sd[..., list(c)].amin(-1) for c in e.part_capsules], -1).clamp(min=0) / PART_PX
-    far = (p[..., 1:] * near / (1 + near / 3)).sum(-1)
+    cell = s.seen[:, None], row, column
+    of = e.part_capsules[e.part[cell]]
+    sd = s.sd[:, :, :n].gather(-1, of.flatten(2).expand(len(s.sd), -1, -1, -1))
+    near = sd.unflatten(-1, of.shape[2:]).amin(-1).clamp(min=0) / PART_PX
+    far = (e.chance[cell] * near / (1 + near / 3)).sum(-1)
     return (far.mean(2) * e.parts_weight[s.seen]).mean(1)
