@@ -255,6 +255,21 @@ def test_temperatures_calm_a_network_that_is_too_sure():
     assert best["surface"] == pytest.approx(2.0, rel=1e-3)
 
 
+def test_weighted_classes_are_taken_back_out_of_the_logits():
+    """What is learnt with weights w from pixels of which a share p is of a class is w p; less log w it is p."""
+    net = Network(4, 2, SMALL)
+    parts = torch.tensor([0] * 90 + [1] * 9 + [2])
+    weights = objective.class_weights(parts, 3)
+    assert torch.isclose((weights[parts]).mean(), torch.tensor(1.0))
+    share = torch.tensor([0.9, 0.09, 0.01])
+    with torch.no_grad():
+        net.dense.weight[:3] = 0
+        net.parts_bias.copy_(torch.log(share * weights))
+        net.parts_bias.sub_(torch.log(weights))
+        got = torch.softmax(net.eval()(torch.randn(1, 6, 64, 64)).parts, 1)[0, :, 3, 3]
+    assert torch.allclose(got, share, atol=1e-5)
+
+
 def test_sides_and_views_have_known_scores():
     names = KNOWN.keypoints
     rng = np.random.default_rng(7)
@@ -312,6 +327,7 @@ def test_a_stopped_training_ends_as_one_that_was_not(tmp_path, monkeypatch):
         train(data, tmp_path / "b", config, Killed())
     assert whole.read_bytes() == train(data, tmp_path / "b", config, Silent()).read_bytes()
     record = json.loads((tmp_path / "b" / "quadruped.json").read_text())
+    assert record["digest"] == Prior(whole).digest
     assert record["metrics"]["true masks"]["samples"] == 8
     assert record["config"]["steps"] == 6
     rows = (tmp_path / "b" / "quadruped.csv").read_text().splitlines()

@@ -110,6 +110,12 @@ class Network(nn.Module):
         self.dec2 = _conv(a, a)
         self.dense = nn.Conv2d(a, parts + 1 + 4, 1)
 
+    @property
+    def parts_bias(self) -> Tensor:
+        """(P+1,) what is added to the logits of parts everywhere; a view of the weights."""
+        assert self.dense.bias is not None
+        return self.dense.bias[: self.parts + 1]
+
     def forward(self, x: Tensor) -> Output:
         half = self.enc2(x)
         quarter = self.enc4(half)

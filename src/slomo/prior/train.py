@@ -85,6 +85,9 @@ def train(data: Path, out: Path, config: TrainConfig, progress: Progress) -> Pat
                 checkpoints.save(trainer.state(), {"step": step})
                 saved = time.monotonic()
     net = trainer.averaged(known)
+    with torch.no_grad():
+        # A network that learns with weighted classes overstates the rare ones by their weight.
+        net.parts_bias.sub_(torch.log(weights))
     about = {
         "kind": config.kind,
         "keypoints": list(known.keypoints),
