@@ -241,9 +241,12 @@ def _diverse(entries: list, count: int) -> list:
 
 
 def _to_rivals(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
-    """The two best go on, and the best one with its left and right legs exchanged: the silhouette hardly tells them
-    apart, and none of the others need be its opposite."""
-    which = losses.argsort()[:2]
+    """The two best go on; the best of another gait than the best one's, because a motion without a gait falls faster
+    at first and less far; and the best one with its left and right legs exchanged, because silhouettes hardly tell the
+    two apart and none of the others need be its opposite."""
+    order = losses.argsort().tolist()
+    other = [k for k in order if run.labels[k]["gait"] != run.labels[order[0]]["gait"]]
+    which = torch.tensor(list(dict.fromkeys(order[:2] + other[:1])))
     best = which[:1]
     x, guess = _pick(run.x, which), run.guess.pick(which)
     opposite = exchanged(problem, _pick(run.x, best), run.guess.pick(best))

@@ -69,9 +69,9 @@ class FitConfig:
     weight_prior: float = 0.05
     weight_facing: float = 0.05
     weight_view: float = 0.05
-    weight_keypoints: float = 0.1
-    weight_parts: float = 0.1
-    weight_surface: float = 0.1
+    weight_keypoints: float = 0.5
+    weight_parts: float = 0.25
+    weight_surface: float = 0.25
 
     def __post_init__(self):
         if self.length_m < 0:
