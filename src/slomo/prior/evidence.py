@@ -12,7 +12,7 @@ from slomo.prior.clip import CENTRES, independent, up_over_clip, view_over_clip
 from slomo.prior.crop import Box, from_crop, network_input
 from slomo.prior.external import ExternalModel
 from slomo.prior.frames import Motion
-from slomo.prior.inference import Prior, mass_at, peaks
+from slomo.prior.inference import Prior, peaks
 from slomo.prior.labels import Labels, rotation_of
 from slomo.prior.user_keypoints import UserKeypoints
 from slomo.skeleton import Skeleton
@@ -61,11 +61,12 @@ class Columns:
 
 @dataclass(frozen=True)
 class Dense:
-    """What only slomo's own networks say, see `stage.run`: `arrays` by their names in the artifact."""
+    """What only slomo's own networks say: `arrays` by their names in the artifact, see `stage.run`; the body's `axes`,
+    and the `length` (F,) px of a body length."""
 
     arrays: dict[str, Array]
-    axis: Array  # (F, 3) expected left axis of the body, view frame
-    length: Array  # (F,) px of a body length
+    axes: sides.Axes
+    length: Array
 
 
 Say = Callable[[float], None]
@@ -86,28 +87,33 @@ def from_network(
     view, path = view_over_clip(seen.view, shots.t)
     up = up_over_clip(seen.up, seen.view, path, shots.t)
     places, mass = peaks(seen.heat, seen.size)
-    parts, surface = seen.parts.copy(), seen.surface.copy()
     sure = mass * seen.seen
-    px = from_crop(places, shots.box[:, None], seen.size)
-    axis = sides.sideways(view, up)
+    axes = sides.axes(view, up)
     length = _body_length(labels, places, sure, view, up, seen.size) * shots.box[:, 2] / seen.size
+    parts, surface = seen.parts.copy(), seen.surface.copy()
 
-    report: dict[str, Any] = {"left_right": {}}
+    decided = {}
     for pair in sides.limb_pairs(skeleton, labels):
-        left, right = pair.left, pair.right
-        cross = [mass_at(seen.heat[:, a], places[:, b], seen.size) for a, b in ((left, right), (right, left))]
-        alone = sides.from_heat(mass[:, left], mass[:, right], *cross)
-        alone += sides.from_visibility(seen.seen[:, left], seen.seen[:, right], axis)
-        swapped, report["left_right"][pair.name] = _settle(pair, skeleton.rest(), px, sure, alone, axis, length, shots)
-        cells = (places + 0.5) * (parts.shape[-1] / seen.size) - 0.5
-        other = sides.parts_disagree(parts, cells, sure, pair)
-        for x in (px, sure):
-            sides.swap_keypoints(x, pair, swapped)
-        sides.swap_parts(parts, surface, pair, swapped ^ other)
+        both = np.stack([pair.left, pair.right])
+        at, own, other, two = sides.assign(seen.heat[:, pair.left], seen.heat[:, pair.right], seen.size)
+        visible = seen.seen[:, both]
+        odd = sides.from_visibility(visible, axes)
+        sides.exchange(visible, odd < -0.5 * sides.NATS)
+        alone = sides.preference(own, other) + 0.5 * sides.from_parts(parts, at, pair, seen.size) + odd
+        px, there = from_crop(at, shots.box[:, None, None], seen.size), np.minimum(own + other, 1)
+        decision, settled = _settle(pair, skeleton, px, there, alone, axes, length, shots)
+        decided[pair.name] = _summary(decision)
+        single = places[:, both]
+        for x in (at, there, single):
+            sides.exchange(x, decision.swapped)
+        at = np.where(two[:, None, :, None], at, single)  # the ends of a blob tell sides, not places
+        places[:, both], sure[:, both] = at, there * visible * settled[:, None]
+        sides.swap_parts(parts, surface, at, there, pair, seen.size)
     say(0.95)
 
     apart = np.abs(np.mod(CENTRES - path[:, None] + np.pi, 2 * np.pi) - np.pi)
-    report |= {
+    report = {
+        "left_right": decided,
         "view_certainty": float(np.where(apart < np.radians(25), view, 0).sum(1).mean()),
         "view_repaired_frames": int((np.where(apart < np.radians(45), seen.view, 0).sum(1) < 0.5).sum()),
     }
@@ -120,8 +126,8 @@ def from_network(
         "surface_scale": _grid(seen.surface_scale[:, None])[:, 0].astype(np.float16),
     }
     confidence = (sure * shots.quality[:, None]).astype(np.float32)
-    columns = Columns(labels.keypoints, px.astype(np.float32), confidence)
-    return columns, Dense(arrays, axis, length), report
+    px = from_crop(places, shots.box[:, None], seen.size).astype(np.float32)
+    return Columns(labels.keypoints, px, confidence), Dense(arrays, axes, length), report
 
 
 def from_model(
@@ -135,19 +141,23 @@ def from_model(
     for f, frame in enumerate(shots.index):
         places[f, where], sure[f, where] = model(shots.frames[frame], Box(*shots.box[f]))
         say(f / F)
-    report: dict[str, Any] = {"left_right": {}}
-    axis = dense.axis if dense else np.zeros((F, 3))
-    length = dense.length if dense else 0.5 * shots.box[:, 2]
-    rest = skeleton.rest()
+    unknown = sides.Axes(np.zeros((F, 3)), np.zeros((F, 2, 2)))
+    axes, length = (dense.axes, dense.length) if dense else (unknown, 0.5 * shots.box[:, 2])
+    decided = {}
     for pair in sides.limb_pairs(skeleton, labels):
-        both = np.isin(pair.left, where) & np.isin(pair.right, where)
-        if both.any():
-            some = sides.Pair(pair.name, pair.left[both], pair.right[both], pair.left_parts, pair.right_parts)
-            alone = np.minimum(sure[:, some.left], sure[:, some.right]).sum(1)  # it is more often right than not
-            swapped, report["left_right"][pair.name] = _settle(some, rest, places, sure, alone, axis, length, shots)
-            for x in (places, sure):
-                sides.swap_keypoints(x, some, swapped)
-    return Columns(names, places[:, where].astype(np.float32), sure[:, where].astype(np.float32)), report
+        both = np.stack([pair.left, pair.right])
+        if not np.isin(both, where).all(0).any():
+            continue
+        at, there = places[:, both], sure[:, both]  # what is not mapped has no confidence and stays at the origin
+        alone = sides.NATS * there.min(1)  # it is more often right than not
+        decision, _ = _settle(pair, skeleton, at, there, alone, axes, length, shots)
+        decided[pair.name] = _summary(decision)
+        mapped = np.isin(both, where).all(0)
+        for x in (at, there):
+            sides.exchange(x, decision.swapped & mapped)
+        places[:, both], sure[:, both] = at, there
+    columns = Columns(names, places[:, where].astype(np.float32), sure[:, where].astype(np.float32))
+    return columns, {"left_right": decided}
 
 
 def from_user(user: UserKeypoints, frame: Array, places: Array, shots: Shots) -> tuple[Columns, dict[str, Any]]:
@@ -176,22 +186,33 @@ def from_user(user: UserKeypoints, frame: Array, places: Array, shots: Shots) ->
 
 
 def _settle(
-    pair: sides.Pair, rest: Array, places: Array, sure: Array, alone: Array, axis: Array, length: Array, shots: Shots
-) -> tuple[Array, dict[str, Any]]:  # fmt: skip
-    """(F,) bool, the frames in which a pair's limbs are to be exchanged, and what is said of it.
+    pair: sides.Pair, skeleton: Skeleton, at: Array, there: Array, alone: Array, axes: sides.Axes, length: Array,
+    shots: Shots,
+) -> tuple[sides.Decision, Array]:  # fmt: skip
+    """Which joints of a pair are to be exchanged, and what the doubt leaves of their confidence, (F, n).
 
     Args:
-        rest: (K, 3) of the skeleton. places: (F, K, 2) px. sure: (F, K). alone: (F,) nats that each frame says.
+        at: (F, 2, n, 2) px, left and right. there: (F, 2, n) in [0, 1], whether there is one of the two.
+        alone: (F, n) nats that the source itself says of each frame. length: (F,) px.
     """
-    left, right = pair.left, pair.right
-    both = np.stack([places[:, left], places[:, right]], 1)
-    confidence = np.stack([sure[:, left], sure[:, right]], 1)
+    rest = skeleton.rest()
+    weight = there.min(1)
+    apart = (at[:, 0] - at[:, 1]) / length[:, None, None]
     width = rest[pair.left, 1] - rest[pair.right, 1]
-    weight = np.minimum(sure[:, left], sure[:, right])
-    alone = alone + sides.from_view(places[:, left], places[:, right], axis, width, length, weight)
-    together = sides.from_motion(both, shots.carried(both), confidence, shots.box[:, 2], shots.t)
-    swapped, margin = sides.decide(alone * independent(shots.t), together)
-    return swapped, {"swapped_frames": int(swapped.sum()), "margin": margin}
+    bone = np.linalg.norm(rest[pair.left] - rest[pair.left[pair.parent]], axis=-1)
+    alone = (alone + weight * sides.from_view(apart, axes, width)) * independent(shots.t)[:, None]
+    along = np.minimum(weight, weight[:, pair.parent]) * sides.hanging_together(apart, bone, pair.parent)
+    together = sides.from_motion(at, shots.carried(at), there, shots.box[:, 2], shots.t)
+    decision = sides.decide(alone, along, together, pair.parent)
+    return decision, sides.identity(decision, at[:, 0] - at[:, 1], shots.box[:, 2])
+
+
+def _summary(decision: sides.Decision) -> dict[str, Any]:
+    return {
+        "swapped": float(decision.swapped.mean()),
+        "margin": decision.margin,
+        "certainty": float(decision.sure.mean()),
+    }
 
 
 def _body_length(labels: Labels, places: Array, sure: Array, view: Array, up: Array, size: int) -> Array:
