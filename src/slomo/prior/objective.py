@@ -98,10 +98,11 @@ def class_weights(parts: Tensor, count: int) -> Tensor:
 class Temperatures:
     """How far logits must be scaled down for their probabilities to be right on samples that were not trained on.
 
-    (Guo et al., ICML 2017.) Of the surface: the factor of the Laplace scale.
+    (Guo et al., ICML 2017.) Of the surface: the factor of the Laplace scale. Never below 1: footage is harder than
+    renderings, and what was learnt from widened labels must not be narrowed, or of two modes the larger one grows.
     """
 
-    GRID = torch.logspace(math.log10(0.25), math.log10(6.0), 41)
+    GRID = torch.logspace(0, math.log10(6.0), 31)
 
     def __init__(self):
         self._loss = {name: torch.zeros(len(self.GRID)) for name in ("parts", "heatmaps", "seen", "view")}
@@ -128,4 +129,4 @@ class Temperatures:
     def best(self) -> dict[str, float]:
         """The temperature of each head."""
         found = {name: round(float(self.GRID[loss.argmin()]), 4) for name, loss in self._loss.items()}
-        return found | {"surface": round(self._miss / max(self._pixels, 1), 4)}
+        return found | {"surface": round(max(1.0, self._miss / max(self._pixels, 1)), 4)}
