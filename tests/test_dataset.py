@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from slomo.errors import UsageError
-from slomo.prior.labels import labels, rotation_of, toward, view_of
+from slomo.prior.labels import SURFACE_UNIT, labels, rotation_of, toward, view_of
 from slomo.skeleton import load_skeleton
 from slomo.stage import Silent
 from slomo.synth import dataset
 from slomo.synth.creature import create, forward, joint_rotation
-from slomo.synth.dataset import UNIT, Config, make_shard, write_dataset
+from slomo.synth.dataset import Config, make_shard, write_dataset
 from slomo.synth.moves import move
 
 KINDS = ("quadruped", "human")
@@ -115,7 +115,7 @@ def test_a_camera_on_the_left_sees_the_left(shard):
 
 def test_the_surface_lies_on_the_resting_body(shard):
     known, z = shard
-    x = z["surface"][z["mask"] > 0] / UNIT
+    x = z["surface"][z["mask"] > 0] / SURFACE_UNIT
     low = np.minimum(known.a, known.b).min(0) - known.radii.max() - 0.05
     high = np.maximum(known.a, known.b).max(0) + known.radii.max() + 0.05
     assert (x > low).all()

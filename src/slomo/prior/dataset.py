@@ -15,12 +15,11 @@ from torch import Tensor
 from slomo.errors import InvalidData, MissingInput
 from slomo.formats import npz
 from slomo.prior.augment import AugmentConfig, Example, Sample, example
-from slomo.prior.labels import Labels
+from slomo.prior.labels import SURFACE_UNIT, Labels
 from slomo.store.files import read_json
 
 Array = np.ndarray
 
-SURFACE_UNIT = 40.0  # steps of a stored surface coordinate a body length
 GROUP = 8  # shards in memory at a time; what is drawn from them is mixed
 _FIELDS = ("rgb", "mask", "flow", "parts", "surface", "keypoints", "visible", "azimuth", "up")
 

@@ -18,6 +18,7 @@ from slomo.skeleton import Skeleton
 Array = np.ndarray
 
 BINS = 36  # of azimuth; bin k is centred at 2 pi k / BINS
+SURFACE_UNIT = 40.0  # steps of a stored surface coordinate a body length
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,8 @@ A shard `<out>/<kind>/shard-00000.npz` holds N samples of 160 x 160 px, square c
 
 - `rgb` (N, S, S, 3) uint8; `mask` (N, S, S) uint8, what is visible of the subject; `flow` (N, S, S, 2) float16 px to
   a frame about 1/15 s later, without the camera's share, 0 away from the mask;
-- `parts` (N, S, S) uint8, labels (0: background); `surface` (N, S, S, 3) int8, canonical coordinates times `UNIT`;
+- `parts` (N, S, S) uint8, labels (0: background); `surface` (N, S, S, 3) int8, canonical coordinates
+  times `SURFACE_UNIT`;
 - `keypoints` (N, K, 2) float32 px, `visible` (N, K) uint8; `azimuth` (N,) and `up` (N, 3) float32, the root view;
 - `move` (N,) what the subject does; `recipe`: JSON of all that it was made from.
 
@@ -24,7 +25,7 @@ import cv2
 import numpy as np
 
 from slomo.errors import UsageError
-from slomo.prior.labels import labels
+from slomo.prior.labels import SURFACE_UNIT, labels
 from slomo.skeleton import list_skeletons, load_skeleton
 from slomo.stage import Progress
 from slomo.store.digest import digest_file
@@ -35,7 +36,6 @@ from slomo.synth.sample import SIZE, parts_of_keypoints, sample
 VERSION = 1  # of the recipe: raise it when the same numbers give other pictures
 SHARD = 64  # samples
 BODY = 16  # samples in a row of one creature: proportions are the slow part of the work
-UNIT = 40.0  # int8 steps a body length
 
 _TRIES = 20
 
@@ -89,7 +89,7 @@ def make_shard(config: Config, number: int) -> dict[str, np.ndarray]:
     grown = [cv2.dilate(m, np.ones((9, 9), np.uint8)) for m in out["mask"]]
     return dict(
         rgb=out["rgb"], mask=out["mask"], flow=(out["flow"] * np.stack(grown)[..., None]).astype(np.float16),
-        parts=out["parts"], surface=np.clip(np.round(out["surface"] * UNIT), -127, 127).astype(np.int8),
+        parts=out["parts"], surface=np.clip(np.round(out["surface"] * SURFACE_UNIT), -127, 127).astype(np.int8),
         keypoints=out["keypoints"].astype(np.float32), visible=out["visible"].astype(np.uint8),
         azimuth=out["azimuth"].astype(np.float32), up=out["up"].astype(np.float32), move=out["move"],
         recipe=np.array(json.dumps(recipe(config), sort_keys=True)),

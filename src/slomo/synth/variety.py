@@ -13,14 +13,14 @@ Array = np.ndarray
 # Factor on the length of every bone of a group, drawn evenly in its logarithm: from a dachshund's legs to a camel's.
 GROUPS = {
     "quadruped": dict(
-        trunk=(0.92, 1.1), shoulder=(0.88, 1.14), neck=(0.5, 1.8), head=(0.65, 1.4), tail=(0.15, 1.7),
+        trunk=(0.92, 1.1), shoulder=(0.88, 1.14), neck=(0.5, 1.8), head=(0.65, 1.6), tail=(0.15, 1.7),
     ),
     "human": dict(trunk=(0.88, 1.12), arm=(0.85, 1.12), leg=(0.75, 1.1), head=(0.9, 1.7)),
 }  # fmt: skip
 # Factor on the radii of parts whose name contains the word; the first that fits.
 GIRTHS = {
-    "quadruped": {"trunk": (0.72, 1.3), "neck": (0.6, 1.35), "head": (0.75, 1.3), "tail": (0.5, 2.6),
-                  "upper": (0.65, 1.25), "lower": (0.6, 1.7)},
+    "quadruped": {"trunk": (0.72, 1.3), "neck": (0.6, 1.35), "head": (0.75, 1.5), "tail": (0.5, 2.8),
+                  "upper": (0.65, 1.25), "lower": (0.6, 1.9)},
     "human": {"trunk": (0.85, 1.45), "head": (0.9, 1.25), "arm": (0.8, 1.7), "thigh": (0.8, 1.6), "shank": (0.8, 1.8)},
 }  # fmt: skip
 # Joint angles that hold the limbs apart while the skin is made: (word in the joint's name, side's sign on x), rad.
@@ -87,8 +87,11 @@ def build(skeleton: Skeleton, rng: np.random.Generator) -> Build:
     jitter[:, 1] *= np.where(skeleton.mirror == np.arange(M), 0.0, np.where(first < np.arange(M), -1, 1))
     scale = np.where(skeleton.group < 0, 1.0, group[np.maximum(skeleton.group, 0)])
     offset = skeleton.offset * (scale * own)[:, None] + jitter
-    width = _factor(rng, 0.75, 1.3)
+    width = _factor(rng, *((0.75, 1.3) if kind == "human" else (0.7, 1.9)))
     offset[:, 1] *= width
+    if kind == "quadruped":  # some are broad in front, some behind
+        hips = np.array(["hip" in n for n in skeleton.names])
+        offset[hips, 1] *= _factor(rng, 0.75, 1.5)
     offset[0] = 0
     girth, known = np.ones(len(skeleton.capsule_link)), labels(skeleton)
     drawn = {p: _factor(rng, *next((r for w, r in GIRTHS[kind].items() if w in p), (0.8, 1.25)))
@@ -151,8 +154,8 @@ def extras(skeleton: Skeleton, what: Build, rng: np.random.Generator) -> list[Ex
         add("neck", drop, neck + drop, u(0.07, 0.15), u(0.06, 0.13), "neck")
         add("withers", drop, what.offset[number["neck"]] + drop, u(0.08, 0.17), u(0.07, 0.15), "neck")
     spine = what.offset[number["withers"]]
-    if chance(0.12):  # one hump or two
-        for x in [(0.1,), (-0.25, 0.35)][int(chance(0.4))]:
+    if chance(0.15):  # one hump or two
+        for x in [(0.1,), (-0.25, 0.35)][int(chance(0.5))]:
             add("spine_mid", [x, 0, 0.04], [x + 0.03, 0, u(0.1, 0.22)], u(0.1, 0.16), u(0.05, 0.09), "trunk")
     if chance(0.5):  # a belly, or a deep chest
         z = u(-0.22, -0.08)
