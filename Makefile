@@ -2,15 +2,18 @@
 # make test   unit tests and an end-to-end smoke test     make check  ruff and pyright
 # make train-prior   pictures, then the networks of src/slomo/prior/weights, from nothing: within the hour on two cores
 # make bench-prior   those networks alone against truth      (WEIGHTS=folder: others; BENCH="--truth ... --masks ...")
+# make bench-terms   reconstruction with and without each term of the prior   (BENCH="--seeds 5 --terms some")
 PYTHON ?= python3
 ROBOT  ?= go1
 DEMO   := demo
 CLIP   := src/slomo/assets/walk
 KINDS  := quadruped human
+STEPS_quadruped := 5500
+STEPS_human     := 4000
 PRIOR  := prior-training
 SHIPPED := src/slomo/prior/weights
 
-.PHONY: demo test slow check clean train-prior bench-prior $(KINDS:%=train-%)
+.PHONY: demo test slow check clean train-prior bench-prior bench-terms $(KINDS:%=train-%)
 .DELETE_ON_ERROR:
 
 demo: .venv/run.stamp
@@ -36,10 +39,13 @@ train-prior: .venv/dev.stamp
 
 $(KINDS:%=train-%): train-%: .venv/dev.stamp
 	.venv/bin/slomo dataset $(PRIOR)/data --kind $* --samples 9600
-	OMP_NUM_THREADS=1 .venv/bin/python -m slomo.prior.train $(PRIOR)/data $(PRIOR) --kind $*
+	OMP_NUM_THREADS=1 .venv/bin/python -m slomo.prior.train $(PRIOR)/data $(PRIOR) --kind $* --steps $(STEPS_$*)
 
 bench-prior: .venv/dev.stamp
 	OMP_NUM_THREADS=1 .venv/bin/python tests/bench_prior.py $(if $(WEIGHTS),--weights $(WEIGHTS)) $(BENCH)
+
+bench-terms: .venv/dev.stamp
+	.venv/bin/python tests/bench_terms.py bench $(BENCH)
 
 .venv/run.stamp: pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "slomo needs Python 3.11 or newer: make PYTHON=python3.11")'

@@ -18,7 +18,7 @@ import numpy as np
 from slomo.formats import load_keypoints
 from slomo.synth.score import score
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared"
 TERMS = ("view", "keypoints", "parts", "surface")
 SYNTH = {
@@ -38,13 +38,9 @@ def variants(which: str) -> dict[str, list[str]]:
 
 
 def slomo(*args: str) -> str:
-    done = subprocess.run(
-        [sys.executable, "-m", "slomo", *args],
-        capture_output=True,
-        text=True,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-    )
-    if done.returncode not in (0, 1):
+    command = [str(Path(sys.executable).with_name("slomo")), *args]
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    if not done.stdout.strip():
         raise SystemExit(done.stderr)
     return done.stdout.strip()
 
