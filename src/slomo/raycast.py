@@ -199,9 +199,8 @@ class Scene:
         rgb = _display(hits.rgb.reshape(*shape, 3).mean(2))
         weights = np.concatenate([hits.uv, 1 - hits.uv.sum(1, keepdims=True)], 1).reshape(*shape, 3)
         points = hits.points.reshape(*shape, 3)
-        return Image(
-            rgb, *(x.reshape(shape) for x in (hits.ids, hits.depth)), points, hits.faces.reshape(shape), weights
-        )
+        ids, depth, faces = hits.ids.reshape(shape), hits.depth.reshape(shape), hits.faces.reshape(shape)
+        return Image(rgb, ids, depth, points, faces, weights)
 
     def picture(self, K: np.ndarray, T_world_cam: np.ndarray, size: Sequence[int]) -> np.ndarray:
         """(H, W, 3) uint8 RGB for the eye: one ray a pixel, four where the picture has an edge. Args as `render`."""
@@ -236,7 +235,7 @@ class Scene:
                 + [wp.array(pixels.astype(np.int32), dtype=int), side, self._light],
                 outputs=[rgb, ids, depth, points, faces, uv],
             )
-        return _Hits(*(x.numpy() for x in (rgb, ids, depth, points, faces, uv)))
+        return _Hits(rgb.numpy(), ids.numpy(), depth.numpy(), points.numpy(), faces.numpy(), uv.numpy())
 
 
 def _display(linear: np.ndarray) -> np.ndarray:

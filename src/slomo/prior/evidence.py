@@ -20,6 +20,7 @@ from slomo.skeleton import Skeleton
 Array = np.ndarray
 
 GRID = 64  # side of the dense arrays that are kept
+SIDE = 0.75  # share of the joints of a pair whose sides a network has right in a clip it has not learnt from
 _REACH = 0.012  # of the box's side: flow is averaged over this around a key point
 
 
@@ -52,11 +53,13 @@ class Shots:
 
 @dataclass(frozen=True)
 class Columns:
-    """Key points of one source: n `names`, `places` (F, n, 2) px of the decoded frames, `confidence` (F, n)."""
+    """Key points of one source: n `names`, `places` (F, n, 2) px of the decoded frames, `confidence` (F, n); `side`:
+    the probability that left and right of a pair are not exchanged in a frame."""
 
     names: tuple[str, ...]
     places: Array
     confidence: Array
+    side: float
 
 
 @dataclass(frozen=True)
@@ -127,7 +130,7 @@ def from_network(
     }
     confidence = (sure * shots.quality[:, None]).astype(np.float32)
     px = from_crop(places, shots.box[:, None], seen.size).astype(np.float32)
-    return Columns(labels.keypoints, px, confidence), Dense(arrays, axes, length), report
+    return Columns(labels.keypoints, px, confidence, SIDE), Dense(arrays, axes, length), report
 
 
 def from_model(
@@ -156,7 +159,7 @@ def from_model(
         for x in (at, there):
             sides.exchange(x, decision.swapped & mapped)
         places[:, both], sure[:, both] = at, there
-    columns = Columns(names, places[:, where].astype(np.float32), sure[:, where].astype(np.float32))
+    columns = Columns(names, places[:, where].astype(np.float32), sure[:, where].astype(np.float32), SIDE)
     return columns, {"left_right": decided}
 
 
@@ -182,7 +185,7 @@ def from_user(user: UserKeypoints, frame: Array, places: Array, shots: Shots) ->
         out[f, said] = shots.motion.carry(places[i, said], source, int(shots.index[f]), reach)
         confidence[f, said] = user.points[i, said, 2]
     report = {"frames_given": len(frame), "frames_unused": unused, "points": int((confidence > 0).sum())}
-    return Columns(user.names, out, confidence), report
+    return Columns(user.names, out, confidence, 1.0), report
 
 
 def _settle(

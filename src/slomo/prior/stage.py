@@ -56,7 +56,8 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
         `evidence.npz`, over F frames; what nobody spoke about has no frames, and nothing has any when nobody spoke:
         frame (F,) decoded frames; box (F, 3) px, left and top edge and side of the crops; view (F, 36) probabilities of
         the azimuth's bins, view_up (F, 3) and view_path (F,) rad, see `prior.labels`; keypoint_names (N,), keypoints
-        (F, N, 2) px and keypoint_confidence (F, N) in [0, 1]; part_names (P,), parts (F, P+1, 64, 64) uint8,
+        (F, N, 2) px, keypoint_confidence (F, N) in [0, 1] and keypoint_side (N,), the probability that it is not on the
+        other limb of its pair; part_names (P,), parts (F, P+1, 64, 64) uint8,
         probability * 255, background first; surface (F, 3, 64, 64) and surface_scale (F, 64, 64) body lengths.
         `report.json`: which sources spoke, and how sure they are.
 
@@ -168,6 +169,7 @@ def _arrays(shots: Shots, known: Labels, columns: dict[str, Columns], dense: Den
         "keypoint_names": np.array([n for s in sources for n in s.names], dtype=str),
         "keypoints": np.concatenate([np.zeros((F, 0, 2), np.float32), *(s.places for s in sources)], 1),
         "keypoint_confidence": np.concatenate([np.zeros((F, 0), np.float32), *(s.confidence for s in sources)], 1),
+        "keypoint_side": np.array([s.side for s in sources for _ in s.names], np.float32),
         "part_names": np.array(known.parts),
         **(dense.arrays if dense else nothing),
     }

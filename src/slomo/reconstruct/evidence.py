@@ -35,7 +35,9 @@ class Evidence:
         view: (F, 36) probabilities of the azimuth. up: (F, 3) unit, body's up in the view frame.
         view_weight: (F,). path: (F,) rad, azimuth decided over the whole clip; NaN without a view.
         trunk: nodes whose middle is what the camera is turned to.
-        node: (N,) the node each key point column speaks of. uv: (F, N, 2) px. confidence: (F, N) in [0, 1].
+        node: (N,) the node each key point column speaks of. uv: (F, N, 2) px. confidence: (F, N) in [0, 1]. alone:
+            columns that mean what they say; pairs: (2, M) columns of left and right that may be exchanged in any frame,
+            and pair_side: (M,) the probability that they are not.
         box: (F, 3) left and top edge and side px of the grid of parts. part: (F, S, S, 2) the two likeliest parts, and
             chance: (F, S, S, 2) their probabilities. parts_weight: (F,). part_capsules: (P, k) capsules of each part,
             those of a part with fewer than k repeated.
@@ -52,6 +54,9 @@ class Evidence:
     node: Tensor
     uv: Tensor
     confidence: Tensor
+    alone: Tensor
+    pairs: Tensor
+    pair_side: Tensor
     box: Tensor
     part: Tensor
     chance: Tensor
@@ -117,7 +122,7 @@ def gather(arrays: Mapping[str, Array], obs: Observations, skeleton: Skeleton) -
     view, has_view = rows("view", like=(BINS,))
     up, _ = rows("view_up", like=(3,))
     path, has_path = rows("view_path", like=())
-    node, uv, confidence = _keypoints(arrays, rows, skeleton, obs.scale)
+    node, uv, confidence, pairing = _keypoints(arrays, rows, skeleton, obs.scale)
     box, _ = rows("box", like=(3,))
     parts, has_parts = rows("parts", like=(len(known.parts) + 1, 1, 1))
     parts = _ordered(parts, arrays, known) if has_parts.any() else parts
@@ -132,7 +137,7 @@ def gather(arrays: Mapping[str, Array], obs: Observations, skeleton: Skeleton) -
     return Evidence(
         unit=f(0.1 * size), view=f(view), up=f(up / np.maximum(np.linalg.norm(up, axis=-1, keepdims=True), 1e-9)),
         view_weight=f(has_view) * obs.quality, path=_filled(path, has_view & has_path),
-        trunk=torch.as_tensor(known.trunk), node=node, uv=f(uv), confidence=f(confidence),
+        trunk=torch.as_tensor(known.trunk), node=node, uv=f(uv), confidence=f(confidence), **pairing,
         box=f(np.where(has_parts[:, None], box * obs.scale, 1.0)),
         **_likeliest(parts), parts_weight=f(has_parts) * obs.quality, part_capsules=_capsules(known),
         **points,
@@ -147,7 +152,9 @@ def _filled(path: Array, known: Array) -> Array:
     return np.interp(np.arange(len(path)), k, np.unwrap(np.asarray(path, float)[k]))
 
 
-def _keypoints(arrays: Mapping[str, Array], rows, skeleton: Skeleton, scale: float) -> tuple[Tensor, Array, Array]:
+def _keypoints(
+    arrays: Mapping[str, Array], rows, skeleton: Skeleton, scale: float
+) -> tuple[Tensor, Array, Array, dict[str, Tensor]]:
     names = [str(n) for n in arrays.get("keypoint_names", ())]
     uv, there = rows("keypoints", like=(len(names), 2))
     confidence, _ = rows("keypoint_confidence", like=(len(names),))
@@ -155,7 +162,24 @@ def _keypoints(arrays: Mapping[str, Array], rows, skeleton: Skeleton, scale: flo
     node = torch.tensor([skeleton.names.index(names[i]) for i in own], dtype=torch.long)
     uv, confidence = np.asarray(uv, float)[:, own], np.asarray(confidence, float)[:, own]
     confidence = np.where(np.isfinite(uv).all(-1) & there[:, None], np.nan_to_num(confidence).clip(0, 1), 0.0)
-    return node, (np.nan_to_num(uv) + 0.5) * scale - 0.5, confidence
+    side = np.asarray(arrays.get("keypoint_side", np.ones(len(names))), float)[own]
+    return node, (np.nan_to_num(uv) + 0.5) * scale - 0.5, confidence, _paired(node.tolist(), side, skeleton)
+
+
+def _paired(node: list[int], side: Array, skeleton: Skeleton) -> dict[str, Tensor]:
+    """Columns whose side is in doubt, with those of the other limb: the nearest with the same doubt, of one source."""
+    pairs: list[tuple[int, int]] = []
+    for i, m in enumerate(node):
+        other = int(skeleton.mirror[m])
+        found = [j for j, n in enumerate(node) if n == other and side[j] == side[i]]
+        if side[i] < 1 and m < other and found:
+            pairs.append((i, min(found, key=lambda j: abs(j - i))))
+    taken = {c for p in pairs for c in p}
+    return dict(
+        alone=torch.tensor([i for i in range(len(node)) if i not in taken], dtype=torch.long),
+        pairs=torch.tensor(pairs, dtype=torch.long).reshape(-1, 2).T,
+        pair_side=torch.tensor([side[i] for i, _ in pairs], dtype=torch.float32),
+    )
 
 
 def _ordered(parts: Array, arrays: Mapping[str, Array], known: Labels) -> Array:

@@ -29,7 +29,7 @@ from slomo.prior.labels import SURFACE_UNIT, labels
 from slomo.skeleton import list_skeletons, load_skeleton
 from slomo.stage import Progress
 from slomo.store.digest import digest_file
-from slomo.store.files import json_bytes, read_json, replace_file
+from slomo.store.files import json_bytes, replace_file
 from slomo.synth.creature import create
 from slomo.synth.sample import SIZE, parts_of_keypoints, sample
 
@@ -153,9 +153,3 @@ def write_dataset(out_dir: Path, config: Config, progress: Progress, *, workers:
     digests = {p.name: digest_file(p) for p in paths}
     replace_file(folder / "dataset.json", json_bytes({"recipe": recipe(config), "shards": digests}))
     return folder / "dataset.json"
-
-
-def read_dataset(folder: Path) -> tuple[dict[str, Any], list[Path]]:
-    """Recipe and shards of a data set's folder."""
-    listed = read_json(folder / "dataset.json")
-    return listed["recipe"], [folder / name for name in sorted(listed["shards"])]

@@ -123,9 +123,9 @@ def _camera_look(rgb: Array, flow: Array, rng: np.random.Generator) -> Array:
     out = out * rng.uniform(0.8, 1.2, 3) + rng.uniform(0, 9) * rng.standard_normal(out.shape, np.float32)
     out = np.clip(out, 0, 255).astype(np.uint8)
     if rng.random() < 0.6:
-        ok, data = cv2.imencode(".jpg", out, [cv2.IMWRITE_JPEG_QUALITY, int(rng.uniform(25, 95))])
-        out = cv2.imdecode(data, cv2.IMREAD_COLOR) if ok else out
-    return out
+        _, data = cv2.imencode(".jpg", out, [cv2.IMWRITE_JPEG_QUALITY, int(rng.uniform(25, 95))])
+        out = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    return np.asarray(out)
 
 
 def parts_of_keypoints(skeleton: Skeleton, known: Labels) -> list[set[int]]:
@@ -143,7 +143,7 @@ def parts_of_keypoints(skeleton: Skeleton, known: Labels) -> list[set[int]]:
 def _visible(node_parts: list[set[int]], parts: Array, uv: Array) -> Array:
     """(K,) whether the pixel of a key point shows a part that the key point is in."""
     u = np.round(uv).astype(int)
-    inside = ((u >= 0) & (u < SIZE)).all(1)
+    inside = np.all((u >= 0) & (u < SIZE), axis=1)
     u = np.clip(u, 0, SIZE - 1)
     label = parts[u[:, 1], u[:, 0]]
     return np.array([bool(i and int(v) in own) for i, v, own in zip(inside, label, node_parts, strict=True)])
