@@ -138,7 +138,7 @@ def test_the_network_s_word_is_kept_by_the_contract(network):
     assert shapes == {
         "frame": (F,), "box": (F, 3), "view": (F, 36), "view_up": (F, 3), "view_path": (F,),
         "keypoint_names": (N,), "keypoints": (F, N, 2), "keypoint_confidence": (F, N), "keypoint_side": (N,),
-        "part_names": (P,),
+        "part_names": (P,), "part_side": (),
         "parts": (F, P + 1, 64, 64), "surface": (F, 3, 64, 64), "surface_scale": (F, 64, 64),
     }  # fmt: skip
     assert tuple(arrays["keypoint_names"]) == QUADRUPED.keypoints

@@ -7,7 +7,7 @@ import numpy as np
 
 from slomo.errors import InvalidData, UsageError
 from slomo.prior.crop import crop_box
-from slomo.prior.evidence import GRID, Columns, Dense, Shots, from_model, from_network, from_user
+from slomo.prior.evidence import GRID, SIDE, Columns, Dense, Shots, from_model, from_network, from_user
 from slomo.prior.external import ExternalModel, load_map
 from slomo.prior.frames import Motion, every
 from slomo.prior.inference import Prior, packaged
@@ -57,7 +57,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
         frame (F,) decoded frames; box (F, 3) px, left and top edge and side of the crops; view (F, 36) probabilities of
         the azimuth's bins, view_up (F, 3) and view_path (F,) rad, see `prior.labels`; keypoint_names (N,), keypoints
         (F, N, 2) px, keypoint_confidence (F, N) in [0, 1] and keypoint_side (N,), the probability that it is not on the
-        other limb of its pair; part_names (P,), parts (F, P+1, 64, 64) uint8,
+        other limb of its pair; part_names (P,), part_side, the same of a pixel, parts (F, P+1, 64, 64) uint8,
         probability * 255, background first; surface (F, 3, 64, 64) and surface_scale (F, 64, 64) body lengths.
         `report.json`: which sources spoke, and how sure they are.
 
@@ -171,5 +171,6 @@ def _arrays(shots: Shots, known: Labels, columns: dict[str, Columns], dense: Den
         "keypoint_confidence": np.concatenate([np.zeros((F, 0), np.float32), *(s.confidence for s in sources)], 1),
         "keypoint_side": np.array([s.side for s in sources for _ in s.names], np.float32),
         "part_names": np.array(known.parts),
+        "part_side": np.float32(SIDE),
         **(dense.arrays if dense else nothing),
     }

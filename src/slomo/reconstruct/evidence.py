@@ -105,6 +105,7 @@ def gather(arrays: Mapping[str, Array], obs: Observations, skeleton: Skeleton) -
     Each fit frame takes the nearest frame of the evidence within half a step of the fit. Key points and parts that the
     skeleton does not have are left out.
     """
+    f = lambda x: torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)  # noqa: E731
     known, at = labels(skeleton), obs.at.numpy()
     frame = np.asarray(arrays.get("frame", []), int)
     step = int(at[1] - at[0]) if len(at) > 1 else 1
@@ -125,13 +126,15 @@ def gather(arrays: Mapping[str, Array], obs: Observations, skeleton: Skeleton) -
     node, uv, confidence, pairing = _keypoints(arrays, rows, skeleton, obs.scale)
     box, _ = rows("box", like=(3,))
     parts, has_parts = rows("parts", like=(len(known.parts) + 1, 1, 1))
+    side = float(arrays.get("part_side", 1.0))
     parts = _ordered(parts, arrays, known) if has_parts.any() else parts
     surface, has_surface = rows("surface", like=(3, 1, 1))
     blur, _ = rows("surface_scale", like=surface.shape[2:])
-    f = lambda x: torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)  # noqa: E731
-    points = _surface(
-        surface, blur, has_surface, parts if has_parts.any() else None, box, obs, known
-    )  # fmt: skip
+    doubted = side * parts + (1 - side) * parts[:, known.mirror_part] if has_parts.any() else parts
+    points = _surface(surface, blur, has_surface, parts if has_parts.any() else None, box, obs, known)
+    # The place on the other limb is as likely as the sides are doubtful: what is left is the difference of the two.
+    sided = known.mirror_part[known.capsule_part] != known.capsule_part
+    points["sure"] = points["sure"] * f(np.where(sided, 2 * side - 1, 1.0))[points["capsule"]]
     area = obs.mask.sum(1).numpy().astype(float)
     size = np.sqrt(np.maximum(area, 0.25 * np.median(area[area > 0])))
     return Evidence(
@@ -139,7 +142,7 @@ def gather(arrays: Mapping[str, Array], obs: Observations, skeleton: Skeleton) -
         view_weight=f(has_view) * obs.quality, path=_filled(path, has_view & has_path),
         trunk=torch.as_tensor(known.trunk), node=node, uv=f(uv), confidence=f(confidence), **pairing,
         box=f(np.where(has_parts[:, None], box * obs.scale, 1.0)),
-        **_likeliest(parts), parts_weight=f(has_parts) * obs.quality, part_capsules=_capsules(known),
+        **_likeliest(doubted), parts_weight=f(has_parts) * obs.quality, part_capsules=_capsules(known),
         **points,
     )  # fmt: skip
 
@@ -194,7 +197,7 @@ def _ordered(parts: Array, arrays: Mapping[str, Array], known: Labels) -> Array:
 
 
 def _likeliest(parts: Array) -> dict[str, Tensor]:
-    """The two likeliest parts of each cell, from uint8 probabilities (F, P + 1, S, S): left and right, mostly."""
+    """The two likeliest parts of each cell, from probabilities * 255 (F, P + 1, S, S): left and right, mostly."""
     chance, part = torch.as_tensor(np.ascontiguousarray(parts[:, 1:].transpose(0, 2, 3, 1))).topk(2, -1)
     return dict(part=part, chance=chance.float() / 255)
 

@@ -19,6 +19,7 @@ from slomo.stage import Progress
 
 Tensor = torch.Tensor
 
+TIE = 0.03  # a rival whose loss is higher by this share may still win in the end
 PHASES = ("heading", "gait", "rivals", "final")
 
 
@@ -62,7 +63,10 @@ def fit(problem: Problem, root: RootGuess, effort: Effort, *, metres: float, see
             label | {"loss": round(float(v), 4)} for label, v in zip(run.labels, losses, strict=True)
         ]
         if run.phase == len(PHASES) - 1:
-            return run
+            order = losses.argsort()
+            run.log["final"] = [run.log["final"][int(k)] for k in order]
+            best = order[:1]
+            return Run(run.phase, _pick(run.x, best), run.guess.pick(best), [run.labels[int(best)]], run.log)
         run = (_to_gait, _to_rivals, _to_final)[run.phase](problem, run, losses, root, effort, metres, progress)
 
 
@@ -269,5 +273,9 @@ def exchanged(problem: Problem, x: Variables, guess: Guess) -> tuple[Variables, 
 
 
 def _to_final(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
-    which = losses.argsort()[:1]
-    return Run(3, _pick(run.x, which), run.guess.pick(which), [run.labels[int(which)]], run.log)
+    """The best one goes on, and with it the best that moves its legs otherwise if it is as good but for `TIE`."""
+    order = losses.argsort().tolist()
+    own = run.labels[order[0]]
+    other = [k for k in order if any(run.labels[k].get(w) != own.get(w) for w in ("gait", "legs"))]
+    which = torch.tensor(order[:1] + [k for k in other[:1] if losses[k] < (1 + TIE) * losses[order[0]]])
+    return Run(3, _pick(run.x, which), run.guess.pick(which), [run.labels[int(k)] for k in which], run.log)

@@ -60,11 +60,11 @@ class FitConfig:
     tilt_static_deg: float = 4.0
     weight_mask: float = 1.0
     weight_reach: float = 0.6
-    weight_flow: float = 0.6
-    weight_stance: float = 0.3
+    weight_flow: float = 0.8
+    weight_stance: float = 0.5
     weight_ground: float = 0.3
     weight_limits: float = 0.05
-    weight_smooth: float = 0.02
+    weight_smooth: float = 0.04
     weight_forward: float = 0.25
     weight_prior: float = 0.05
     weight_facing: float = 0.05
