@@ -20,7 +20,11 @@ from slomo.skeleton import Skeleton
 Array = np.ndarray
 
 GRID = 64  # side of the dense arrays that are kept
-SIDE = 0.75  # share of the joints of a pair whose sides a network has right in a clip it has not learnt from
+# Share of the joints of a pair whose sides a network has right in a clip it has not learnt from. People are as often
+# seen from behind as from the front by a network that errs for a whole clip: nothing is made of their sides.
+SIDE = {"quadruped": 0.75}
+NO_SIDE = 0.5
+MODEL_SIDE = 0.75  # of a model of the user's, likewise
 _REACH = 0.012  # of the box's side: flow is averaged over this around a key point
 
 
@@ -120,8 +124,10 @@ def from_network(
         "view_certainty": float(np.where(apart < np.radians(25), view, 0).sum(1).mean()),
         "view_repaired_frames": int((np.where(apart < np.radians(45), seen.view, 0).sum(1) < 0.5).sum()),
     }
+    side = SIDE.get(labels.kind, NO_SIDE)
     arrays = {
-        "view": view,
+        "part_side": np.float32(side),
+        "view": view if labels.kind in SIDE else 0.5 * (view + front_to_back(view)),
         "view_up": up,
         "view_path": path,
         "parts": np.rint(255 * _grid(parts)).astype(np.uint8),
@@ -130,7 +136,12 @@ def from_network(
     }
     confidence = (sure * shots.quality[:, None]).astype(np.float32)
     px = from_crop(places, shots.box[:, None], seen.size).astype(np.float32)
-    return Columns(labels.keypoints, px, confidence, SIDE), Dense(arrays, axes, length), report
+    return Columns(labels.keypoints, px, confidence, side), Dense(arrays, axes, length), report
+
+
+def front_to_back(view: Array) -> Array:
+    """(F, 36) the view of a body of the same outline that looks the other way: azimuth a becomes pi - a."""
+    return np.roll(view[:, ::-1], 1 + view.shape[1] // 2, 1)
 
 
 def from_model(
@@ -159,7 +170,7 @@ def from_model(
         for x in (at, there):
             sides.exchange(x, decision.swapped & mapped)
         places[:, both], sure[:, both] = at, there
-    columns = Columns(names, places[:, where].astype(np.float32), sure[:, where].astype(np.float32), SIDE)
+    columns = Columns(names, places[:, where].astype(np.float32), sure[:, where].astype(np.float32), MODEL_SIDE)
     return columns, {"left_right": decided}
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from slomo.errors import InvalidData, UsageError
 from slomo.prior.crop import crop_box
-from slomo.prior.evidence import GRID, SIDE, Columns, Dense, Shots, from_model, from_network, from_user
+from slomo.prior.evidence import GRID, Columns, Dense, Shots, from_model, from_network, from_user
 from slomo.prior.external import ExternalModel, load_map
 from slomo.prior.frames import Motion, every
 from slomo.prior.inference import Prior, packaged
@@ -18,7 +18,7 @@ from slomo.stage import Artifact, Inputs, Progress
 
 Array = np.ndarray
 
-VERSION = 1
+VERSION = 2
 
 PRIORS = ("auto", "none")
 
@@ -156,6 +156,7 @@ def _arrays(shots: Shots, known: Labels, columns: dict[str, Columns], dense: Den
     sources = list(columns.values())
     P = len(known.parts)
     nothing = {
+        "part_side": np.float32(1.0),
         "view": np.zeros((0, BINS), np.float32),
         "view_up": np.zeros((0, 3), np.float32),
         "view_path": np.zeros(0, np.float32),
@@ -171,6 +172,5 @@ def _arrays(shots: Shots, known: Labels, columns: dict[str, Columns], dense: Den
         "keypoint_confidence": np.concatenate([np.zeros((F, 0), np.float32), *(s.confidence for s in sources)], 1),
         "keypoint_side": np.array([s.side for s in sources for _ in s.names], np.float32),
         "part_names": np.array(known.parts),
-        "part_side": np.float32(SIDE),
         **(dense.arrays if dense else nothing),
     }

@@ -25,6 +25,9 @@ VIEW_UNIT = 3.0  # nats
 UP_UNIT = 1 - math.cos(math.radians(20.0))
 UP_SHARE = 0.2  # of the body's up axis in the view term
 PART_PX = 5.0
+# Tenths of the subject's size: joints of the skeleton and those that a network has learnt, or a user clicks, are not the
+# same points of the body by about this much. Evidence tells the poses apart; within this the silhouette is better.
+PRECISE = 0.3
 
 
 def terms(evidence: Evidence) -> Mapping[str, Term]:
@@ -94,8 +97,8 @@ def surface(e: Evidence, s: State) -> Tensor:
 def _distance(e: Evidence, s: State, X: Tensor, uv: Tensor, weight: Tensor) -> Tensor:
     """(H, F, N) weighted robust distances of the pictures of camera-frame points X (H, F, N, 3) from uv (F, N, 2)."""
     u, v, _ = silhouette.project(s.obs.K, X)
-    far = ((u - uv[..., 0]) ** 2 + (v - uv[..., 1]) ** 2) / e.unit[:, None] ** 2
-    return weight * torch.log1p(far)
+    d = torch.sqrt((u - uv[..., 0]) ** 2 + (v - uv[..., 1]) ** 2 + 1e-6) / e.unit[:, None]
+    return weight * torch.log1p((d - PRECISE).clamp(min=0) ** 2)
 
 
 def parts(e: Evidence, s: State) -> Tensor:

@@ -21,7 +21,7 @@ from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import Skeleton, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 3
+FIT_VERSION = 4
 
 # The rest pose at the right place overlaps by 0.5 to 0.6, a fit that is right by 0.75 and more. Below this the body is
 # elsewhere or another shape in many frames, and its key points do not follow the subject.
@@ -106,7 +106,7 @@ def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
     spread = np.radians(config.tilt_moving_deg if mode == "moving" else config.tilt_static_deg)
     weights = config.weights()
     said = _evidence(inputs, obs, skeleton, weights)
-    if skeleton.kind != "human" or (said and "view" in said.groups):
+    if skeleton.kind != "human":
         weights["facing"] = 0.0
     terms = {**losses.TERMS, **(evidence_terms.terms(said) if said else {})}
     problem = Problem(obs, kin, path, weights, float(spread), terms, said)
