@@ -259,3 +259,37 @@ def test_the_nearest_place_of_the_body_undoes_the_canonical_coordinate():
     X = KNOWN.canonical(c, s, n)
     found = nearest(X, KNOWN.capsule_part[c], KNOWN)
     np.testing.assert_allclose(KNOWN.canonical(*found), X, atol=2e-3)
+
+
+def test_doubted_sides_cost_no_more_than_their_odds_and_prefer_the_right_way(scene: Scene):
+    N = len(SKELETON.names)
+    doubted = gather({**scene.arrays, "keypoint_side": np.full(N, 0.75)}, scene.obs, SKELETON)
+    sided = int((SKELETON.mirror != np.arange(N)).sum())
+    assert doubted.pairs.shape == (2, sided // 2)
+    assert all(SKELETON.mirror[doubted.node[i]] == doubted.node[j] for i, j in doubted.pairs.T.tolist())
+    assert sorted([*doubted.alone.tolist(), *doubted.pairs.flatten().tolist()]) == list(range(N))
+    assert not len(scene.said.pair_side)  # the user's own are never exchanged
+
+    def value(said: Evidence, guess: Guess) -> float:
+        problem = scene.problem(said, {"keypoints": 1.0})
+        return float(problem.loss(scene.x, guess, problem.draw(T, 400, torch.Generator().manual_seed(1)))[0])
+
+    swapped = _mirrored(scene.true)
+    right = value(doubted, scene.true)
+    assert right < value(doubted, swapped)
+    wrong = scene.arrays | {"keypoints": scene.arrays["keypoints"][:, SKELETON.mirror]}
+    exchanged = gather({**wrong, "keypoint_side": np.full(N, 0.75)}, scene.obs, SKELETON)
+    cost = value(exchanged, scene.true) - right
+    assert 0 < cost <= np.log(3) * sided / 2 / N + 1e-6
+    assert cost < 0.7 * value(gather(wrong, scene.obs, SKELETON), scene.true)
+
+
+def test_parts_of_doubted_sides_speak_for_both_limbs(scene: Scene):
+    even = gather({**scene.arrays, "part_side": np.float32(0.5)}, scene.obs, SKELETON)
+    left = KNOWN.parts.index("front_left_lower")
+    seen = even.part[..., 0] == left
+    assert seen.any()
+    assert (even.part[..., 1][seen] == left + 1).all()  # the right one is as likely
+    assert torch.allclose(even.chance[..., 0][seen], even.chance[..., 1][seen])
+    sided = KNOWN.mirror_part[KNOWN.capsule_part] != KNOWN.capsule_part
+    assert (even.sure[torch.as_tensor(sided)[even.capsule]] == 0).all()

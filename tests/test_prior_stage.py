@@ -418,3 +418,12 @@ def test_parameters_out_of_range():
     with pytest.raises(UsageError, match=r"evidence\.fps: is 0"):
         stage.Config(fps=0)
     assert {"parts", "heatmaps", "seen", "view"} < set(OUTPUTS)
+
+
+def test_front_and_back_of_one_outline():
+    from slomo.prior.evidence import front_to_back
+
+    view = np.zeros((2, 36))
+    view[0, 2], view[1, 9] = 1, 1
+    assert front_to_back(view).argmax(1).tolist() == [16, 9]
+    assert np.array_equal(front_to_back(front_to_back(view)), view)

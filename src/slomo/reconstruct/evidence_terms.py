@@ -25,8 +25,8 @@ VIEW_UNIT = 3.0  # nats
 UP_UNIT = 1 - math.cos(math.radians(20.0))
 UP_SHARE = 0.2  # of the body's up axis in the view term
 PART_PX = 5.0
-# Tenths of the subject's size: joints of the skeleton and those that a network has learnt, or a user clicks, are not the
-# same points of the body by about this much. Evidence tells the poses apart; within this the silhouette is better.
+# Tenths of the subject's size: joints of the skeleton and those that a network has learnt, or a user clicks, are not
+# the same points of the body by about this much. Evidence tells the poses apart; within this the silhouette is better.
 PRECISE = 0.3
 
 
