@@ -162,7 +162,7 @@ def test_the_network_s_word_is_kept_by_the_contract(network):
 
 
 def test_without_anybody_there_is_nothing():
-    for config, said in ((stage.Config(prior="none"), "no prior"), (stage.Config(), "slomo has none for a skeleton")):
+    for config, said in ((stage.Config(prior="none"), "no prior"), (stage.Config(), "used unless you name it")):
         notes = Notes()
         arrays, report = run(config, notes)
         assert said in " ".join(notes.said)

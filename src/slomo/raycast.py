@@ -100,7 +100,7 @@ def _linear(srgb) -> np.ndarray:
     return np.asarray(srgb, np.float32) ** 2.2
 
 
-def _normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """(V, 3) area-weighted vertex normals."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     face = np.cross(b - a, c - a)
@@ -141,7 +141,7 @@ class Scene:
         self._local = np.concatenate(vertices)
         self._world = self._local.copy()
         self._faces = np.concatenate(triangles)
-        self._local_normals = _normals(self._local, self._faces)
+        self._local_normals = vertex_normals(self._local, self._faces)
         self._world_normals = self._local_normals.copy()
         with wp.ScopedDevice(self.device):
             self._colors = wp.array(np.concatenate(colors), dtype=wp.vec3)
@@ -181,7 +181,7 @@ class Scene:
                 f = self._triangles[name]
                 self._world[s] = pose[f.ravel()] if name in self._flat else pose
                 local = np.arange(3 * len(f)).reshape(-1, 3) if name in self._flat else f
-                self._world_normals[s] = _normals(self._world[s], local)
+                self._world_normals[s] = vertex_normals(self._world[s], local)
         # A tree that is only refitted keeps the layout of an old pose, and rays may then take a hundred times longer.
         if self._moves % 16 == 0:
             self._build()

@@ -18,7 +18,8 @@ Array = np.ndarray
 
 @dataclass(frozen=True)
 class Sample:
-    """One stored sample of S0 x S0 px: see `slomo.synth.dataset`. `flow` is float32, `surface` body lengths * 40."""
+    """One stored sample of S0 x S0 px: see `slomo.synth.dataset`. `flow` is float32, `surface` body lengths times
+    `SURFACE_UNIT`."""
 
     rgb: Array
     mask: Array
@@ -37,7 +38,7 @@ class Example:
 
     Attributes:
         input: (6, S, S) float32.
-        parts: (S/2, S/2) uint8 labels. surface: (3, S/2, S/2) int8, body lengths * 40, where parts > 0.
+        parts: (S/2, S/2) uint8 labels. surface: (3, S/2, S/2) int8, body lengths times `SURFACE_UNIT`, where parts > 0.
         keypoints: (K, 2) float32 px of the crop. visible: (K,) 0 or 1.
         azimuth: rad. up: (3,).
     """

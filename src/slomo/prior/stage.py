@@ -116,7 +116,9 @@ def _prior(inputs: Inputs, config: Config, known: Labels, progress: Progress) ->
         progress.note("evidence: no prior")
         return None
     if path is None:
-        progress.note(f"evidence: no prior, slomo has none for a skeleton of the kind {known.kind!r}")
+        progress.note(
+            f"evidence: no prior, slomo has none for {known.kind!r} that is used unless you name it (--prior FILE)"
+        )
         return None
     prior = Prior(path)
     if why := prior.misfit(known):

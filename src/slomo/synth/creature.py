@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slomo.prior.labels import labels
+from slomo.raycast import vertex_normals
 from slomo.skeleton import Skeleton
 from slomo.synth.coat import coat
 from slomo.synth.flesh import Cone, mesh, value_noise
@@ -84,11 +85,8 @@ class Creature:
 
 def _roughened(vertices: Array, triangles: Array, amount: float, rng: np.random.Generator) -> Array:
     """Vertices pushed along their normals by noise of up to `amount`."""
-    corner = vertices[triangles]
-    face = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal = np.stack([np.bincount(triangles.ravel(), np.repeat(f, 3), len(vertices)) for f in face.T], 1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    return vertices + amount * (2 * value_noise(vertices * 25, rng) - 1)[:, None] * normal
+    noise = 2 * value_noise(vertices * 25, rng) - 1
+    return vertices + amount * noise[:, None] * vertex_normals(vertices, triangles)
 
 
 def create(skeleton: Skeleton, seed: int) -> Creature:

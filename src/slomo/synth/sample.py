@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from slomo.prior.crop import MARGIN, compensate
+from slomo.prior.frames import SPAN
 from slomo.prior.labels import Labels, toward, view_of
 from slomo.raycast import Image, Light, Part, Scene, look_at
 from slomo.skeleton import Skeleton
@@ -18,7 +19,6 @@ Array = np.ndarray
 
 SIZE = 160  # px, side of a sample
 SUBJECT, OTHER = 1, 2  # ids of parts
-STILL = 1 / 15  # s between the two frames of the flow, about: what the fit uses
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def sample(c: Creature, known: Labels, node_parts: list[set[int]], rng: np.rando
     Args:
         node_parts: of each key point, the labels of the parts that it is in.
     """
-    t = np.array([0.0, STILL * rng.uniform(0.5, 1.5)]) + rng.uniform(0, 10)
+    t = np.array([0.0, SPAN * rng.uniform(0.5, 1.5)]) + rng.uniform(0, 10)
     m = move(c, t, rng)
     vertices = [c.skin(m.R[i], m.nodes[i, : c.skeleton.link_count]) for i in (0, 1)]
     shot = _shot(vertices[0], rng)
