@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slomo.flesh import Cone, mesh, value_noise
 from slomo.synth.animal import BONES, KEYPOINTS, Proportions, rest_joints
-from slomo.synth.flesh import Cone, mesh, value_noise
 
 
 def _flesh(p: Proportions, j: dict[str, np.ndarray]) -> list[Cone]:

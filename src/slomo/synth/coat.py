@@ -4,8 +4,8 @@ import colorsys
 
 import numpy as np
 
+from slomo.flesh import value_noise
 from slomo.skeleton import Skeleton
-from slomo.synth.flesh import value_noise
 
 Array = np.ndarray
 

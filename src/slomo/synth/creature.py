@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slomo.flesh import Cone, mesh, value_noise
 from slomo.prior.labels import labels
 from slomo.raycast import vertex_normals
 from slomo.skeleton import Skeleton
 from slomo.synth.coat import coat
-from slomo.synth.flesh import Cone, mesh, value_noise
 from slomo.synth.variety import Build, build, extras
 
 Array = np.ndarray
