@@ -67,7 +67,7 @@ def test_chained_flow_and_the_frames_between():
     np.testing.assert_allclose(np.median(flow.chain(6, 0)[inner], axis=0), [-12, 0], atol=0.04 * 12)
     np.testing.assert_allclose(np.median(flow.chain(0, 6)[np.roll(inner, -12, 1)], axis=0), [12, 0], atol=0.04 * 12)
     layers = {t: masks[t].astype(np.float32) for t in (0, 2, 4, 6, 7)}
-    filled = blend_over_time(layers, flow, lambda f: None, neighbours=1)
+    filled = np.stack([*blend_over_time(layers, flow, lambda f: None, neighbours=1)])
     assert iou(filled > 0.5, masks).min() > 0.9
 
 

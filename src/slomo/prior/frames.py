@@ -17,11 +17,17 @@ def every(t: Array, fps: float) -> int:
     return 1 if step > len(t) // 3 else step
 
 
+def spread(field: Array, size: tuple[int, int]) -> Array:
+    """(H, W, 2) float32: flow (h, w, 2) on a coarser grid of a picture of `size` (W, H) px, at each of its pixels."""
+    field = np.asarray(field, np.float32)
+    return field if field.shape[1::-1] == size else cv2.resize(field, size, interpolation=cv2.INTER_LINEAR)
+
+
 class Motion:
     """The subject's motion in the picture.
 
     Args:
-        flow: (T-1, H, W, 2) px, frame t -> t+1. masks: (T, H, W) bool. t: (T,) s.
+        flow: (T-1, h, w, 2) px of the pictures, frame t -> t+1, on a grid over them. masks: (T, H, W) bool. t: (T,) s.
     """
 
     def __init__(self, flow: Array, masks: Array, t: Array):
@@ -31,11 +37,11 @@ class Motion:
     def at(self, frame: int) -> Array:
         """(H, W, 2) float32 px from the frame to about `SPAN` later; of the last frames, what came before."""
         first = max(0, min(frame, len(self._flow) - self._apart))
-        total = np.array(self._flow[first], np.float32)
-        h, w = total.shape[:2]
+        h, w = self._masks.shape[1:]
+        total = spread(self._flow[first], (w, h)).copy()
         x, y = np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32))
         for f in range(first + 1, min(first + self._apart, len(self._flow))):
-            step = np.asarray(self._flow[f], np.float32)
+            step = spread(self._flow[f], (w, h))
             there = x + total[..., 0], y + total[..., 1]
             total += cv2.remap(step, *there, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return total
@@ -58,5 +64,6 @@ class Motion:
         uv = np.rint(points[:, None] + reach * _AROUND).astype(int)
         u, v = np.clip(uv[..., 0], 0, w - 1), np.clip(uv[..., 1], 0, h - 1)
         weight = self._masks[frame][v, u] + 1e-3
-        moved = np.asarray(self._flow[index][v, u], float) * weight[..., None]
+        rows, columns = self._flow[index].shape[:2]
+        moved = np.asarray(self._flow[index][v * rows // h, u * columns // w], float) * weight[..., None]
         return moved.sum(1) / weight.sum(1)[:, None]

@@ -16,7 +16,7 @@ _SHADOW = (0.3, 0.95)  # a cast shadow multiplies the ground's colour by a facto
 class Overlay:
     """Frames shrunk to `size` (width, height) in RGB, and the tracks that lay them over each other."""
 
-    rgb: np.ndarray  # (T, h, w, 3) float32
+    rgb: np.ndarray  # (T, h, w, 3) uint8
     tracks: list[dict[int, np.ndarray]]
     factor: float
 
@@ -26,7 +26,7 @@ class Overlay:
         table: list[dict[int, np.ndarray]] = [{} for _ in frames]
         for t, i, xy in zip(tracks.frame.tolist(), tracks.track.tolist(), tracks.xy, strict=True):
             table[t][i] = xy
-        return cls(np.array(rgb, np.float32), table, size[0] / frames.shape[2])
+        return cls(np.array(rgb), table, size[0] / frames.shape[2])
 
     def homography(self, source: int, target: int) -> np.ndarray | None:
         """(3, 3) from shrunk pixels of `source` to those of `target`, or None when too few tracks last."""
@@ -51,7 +51,7 @@ class Overlay:
             if (model := self.homography(t, u)) is None:
                 continue
             flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-            samples.append(cv2.warpPerspective(self.rgb[u], model, (w, h), flags=flags))
+            samples.append(cv2.warpPerspective(self.rgb[u].astype(np.float32), model, (w, h), flags=flags))
             free = (~covered[u]).astype(np.float32)
             valid.append(cv2.warpPerspective(free, model, (w, h), flags=flags, borderValue=0.0) > 0.7)
         if len(samples) < 2:
@@ -61,9 +61,9 @@ class Overlay:
         order = np.sort(np.where(ok[..., None], x, np.inf), axis=0)
         middle = np.clip((count - 1) // 2, 0, None)[None, ..., None]
         median = np.take_along_axis(order, middle, axis=0)[0]
-        median = np.where(np.isfinite(median), median, self.rgb[t])
+        now = self.rgb[t].astype(np.float32)
+        median = np.where(np.isfinite(median), median, now)
         spread = (np.abs(x - median).mean(-1) * ok).sum(0) / np.maximum(count, 1)
-        now = self.rgb[t]
         size = np.linalg.norm(now - median, axis=-1)
         shade = (now * median).sum(-1) / np.maximum((median**2).sum(-1), 1.0)
         in_shade = np.linalg.norm(now - shade[..., None] * median, axis=-1)

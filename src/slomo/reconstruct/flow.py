@@ -1,6 +1,7 @@
 """Dense optical flow between consecutive frames and what follows from it: consistency, warping, chains.
 
-Flow (H, W, 2) px is x then y: the pixel p of the first image is at p + flow[p] in the second.
+Flow (H, W, 2) px is x then y: the pixel p of the first image is at p + flow[p] in the second. A clip's flow is kept
+on a grid of half as many cells either way, which is the one that it is computed on, and is spread when it is used.
 """
 
 from dataclasses import dataclass
@@ -9,29 +10,32 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
+from slomo.prior.frames import spread
+
 
 @dataclass(frozen=True)
 class Flow:
-    """Flow of a clip of T frames.
+    """Flow of a clip of T frames of H x W pixels, on a grid of h x w cells that covers them.
 
     Attributes:
-        forward: (T-1, H, W, 2) float16 px, frame t -> t+1.
-        backward: (T-1, H, W, 2) float16 px, frame t+1 -> t.
-        consistent: (T-1, H, W) bool, at pixels of frame t: forward then backward leads home.
+        forward: (T-1, h, w, 2) float16, px of the frames, frame t -> t+1.
+        backward: (T-1, h, w, 2) float16, px of the frames, frame t+1 -> t.
+        consistent: (T-1, h, w) bool, at cells of frame t: forward then backward leads home.
+        size: (W, H) px of the frames.
     """
 
     forward: np.ndarray
     backward: np.ndarray
     consistent: np.ndarray
+    size: tuple[int, int]
 
     def step(self, source: int, target: int) -> np.ndarray:
         """(H, W, 2) float32 px from frame `source` to its neighbour `target`."""
-        field = self.forward[source] if target > source else self.backward[target]
-        return field.astype(np.float32)
+        return spread(self.forward[source] if target > source else self.backward[target], self.size)
 
     def chain(self, source: int, target: int) -> np.ndarray:
         """(H, W, 2) float32 px from frame `source` to any frame `target`, by composing the steps between."""
-        total = np.zeros((*self.forward.shape[1:3], 2), np.float32)
+        total = np.zeros((self.size[1], self.size[0], 2), np.float32)
         direction = 1 if target > source else -1
         for t in range(source, target, direction):
             total += sample(self.step(t, t + direction), total)
@@ -41,16 +45,19 @@ class Flow:
 def dense_flow(frames: np.ndarray, progress=lambda fraction: None) -> Flow:
     """DIS flow (Kroeger et al., ECCV 2016; medium preset) of (T, H, W, 3) uint8 RGB frames, both ways."""
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    gray = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames]
-    shape = (len(frames) - 1, *frames.shape[1:3])
+    gray = (cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames)
+    height, width = frames.shape[1:3]
+    cells = ((width + 1) // 2, (height + 1) // 2)
+    shape = (len(frames) - 1, cells[1], cells[0])
     forward, backward = np.empty((*shape, 2), np.float16), np.empty((*shape, 2), np.float16)
     consistent = np.empty(shape, bool)
     for t, (a, b) in enumerate(pairwise(gray)):
         there, back = dis.calc(a, b, None), dis.calc(b, a, None)  # type: ignore[call-overload]
-        forward[t], backward[t] = there, back
-        consistent[t] = _consistent(there, back)
+        forward[t], backward[t] = (cv2.resize(f, cells, interpolation=cv2.INTER_AREA) for f in (there, back))
+        home = _consistent(there, back).astype(np.float32)
+        consistent[t] = cv2.resize(home, cells, interpolation=cv2.INTER_AREA) > 0.5
         progress((t + 1) / shape[0])
-    return Flow(forward, backward, consistent)
+    return Flow(forward, backward, consistent, (width, height))
 
 
 def _consistent(there: np.ndarray, back: np.ndarray) -> np.ndarray:

@@ -57,31 +57,32 @@ class MotionSegmenter:
             )
         # A moment of rest has a weak score everywhere: it is not stretched to full scale, its neighbours speak for it.
         layers = {k: np.clip(d / max(top[k], 0.5 * strength), 0, 1).astype(np.float32) for k, d in score.items()}
-        moving = blend_over_time(layers, small, lambda f: progress(0.3 + 0.1 * f), neighbours=3)
+        moving = np.stack([*blend_over_time(layers, small, lambda f: progress(0.3 + 0.1 * f), neighbours=3)])
 
         tracks = background_tracks(frames, np.zeros(frames.shape[:3], bool))
         overlay = Overlay.of(frames, tracks, size)
-        prior = {k: cv2.resize(moving[k], (W, H), interpolation=cv2.INTER_LINEAR) for k in keys}
+        whole = lambda small: cv2.resize(small, (W, H), interpolation=cv2.INTER_LINEAR)  # noqa: E731
         # At first whatever may be the subject is kept out of the background, later what is thought to be.
         covered = {k: moving[k] > 0.3 for k in keys}
-        body = {k: component_at(prior[k] > 0.5) for k in keys}
+        body = {k: component_at(whole(moving[k]) > 0.5) for k in keys}
         for turn in range(self.rounds):
             last = turn == self.rounds - 1
             differs = {}
             for k in keys:
                 others = [u for u in keys if 5 < abs(u - k) <= _REACH][:: max(1, 4 // self.every)]
-                differs[k] = cv2.resize(overlay.evidence(k, covered, others), (W, H), interpolation=cv2.INTER_LINEAR)
+                differs[k] = overlay.evidence(k, covered, others)
             progress(0.4 + 0.5 * (turn + 0.4) / self.rounds)
             model = learn_colours(frames, body) if turn else None
             for k in keys:
-                body[k] = _refine(frames[k], prior[k], differs[k], body[k], model, last=last)
+                body[k] = _refine(frames[k], whole(moving[k]), whole(differs[k]), body[k], model, last=last)
                 small_body = cv2.resize(body[k].astype(np.float32), size, interpolation=cv2.INTER_AREA)
                 covered[k] = cv2.dilate((small_body > 0.1).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
             progress(0.4 + 0.5 * (turn + 1) / self.rounds)
         # One neighbour on either side: flow carries the body far, but not legs.
-        layers = {k: m.astype(np.float32) for k, m in body.items()}
-        probability = blend_over_time(layers, flow, lambda f: progress(0.9 + 0.1 * f), neighbours=1)
-        masks = np.stack([component_at(p > 0.45, reach=round(0.06 * np.sqrt((p > 0.5).sum()))) for p in probability])
+        probability = blend_over_time(body, flow, lambda f: progress(0.9 + 0.1 * f), neighbours=1)
+        masks = np.empty(frames.shape[:3], bool)
+        for t, p in enumerate(probability):
+            masks[t] = component_at(p > 0.45, reach=round(0.06 * np.sqrt((p > 0.5).sum())))
         if not masks.any():
             raise no_subject("what moves has no colours of its own")
         return Masks(masks, {"motion_px": strength, "motion_gap_frames": self.gap})
@@ -89,17 +90,17 @@ class MotionSegmenter:
 
 def shrink_flow(flow: Flow, size: tuple[int, int]) -> Flow:
     """The flow at `size` (width, height) px, in px of that size."""
-    factor = size[0] / flow.forward.shape[2]
+    factor = size[0] / flow.size[0]
 
     def smaller(fields: np.ndarray) -> np.ndarray:
         shape = (len(fields), size[1], size[0], 2)
-        out = np.empty(shape, np.float32)
+        out = np.empty(shape, np.float16)
         for t, field in enumerate(fields):
             out[t] = factor * cv2.resize(field.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         return out
 
     consistent = [cv2.resize(c.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) for c in flow.consistent]
-    return Flow(smaller(flow.forward), smaller(flow.backward), np.array(consistent, bool))
+    return Flow(smaller(flow.forward), smaller(flow.backward), np.array(consistent, bool), size)
 
 
 def motion_score(flow: Flow, t: int, gap: int) -> np.ndarray:

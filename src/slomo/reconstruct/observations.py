@@ -4,7 +4,7 @@ Fit frames are every n-th frame of the clip; the flow between two of them is the
 """
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -12,13 +12,14 @@ import numpy as np
 import torch
 
 from slomo.errors import InvalidData
-from slomo.prior.frames import every
+from slomo.prior.frames import every, spread
 from slomo.reconstruct.silhouette import Intrinsics
 
 Array = np.ndarray
 Tensor = torch.Tensor
 
 STATIC_PX = 0.35  # a pixel moves with the ground when its flow differs by about this many working pixels
+MOST_PIXELS = 30e6  # working pixels of all fit frames together, each of which takes about 40 bytes
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,8 @@ def observe(
     Args:
         frames_t: (T,) s. masks, flow, camera: the arrays of the upstream artifacts.
         fps: fit frames a second at most.
-        subject_px: wanted size of the subject (root of its area) in working pixels; never above the clip's own.
+        subject_px: wanted size of the subject (root of its area) in working pixels; never above the clip's own, and
+            less where a long clip with a small subject would take too much memory (`MOST_PIXELS`).
 
     Raises:
         InvalidData: the artifacts disagree about the number of frames, or no frame has a subject.
@@ -80,43 +82,42 @@ def observe(
     if len(set(counts.values())) != 1:
         raise InvalidData(f"the parts disagree about the number of frames: {counts}", where="reconstruct")
     at = np.arange(0, T, every(frames_t, fps))
-    full = unpack(masks["packed"][at], masks["shape"])
-    area = full.sum((1, 2))
+    full = [unpack(masks["packed"][k], masks["shape"]) for k in at]
+    area = np.array([m.sum() for m in full])
     if not (area > 0).any():
         raise InvalidData("no frame shows the subject", where="masks", todo="give masks with --masks")
     scale = min(1.0, subject_px / float(np.sqrt(np.median(area[area > 0]))))
+    scale = min(scale, float(np.sqrt(MOST_PIXELS / (len(at) * height * width))))
     w, h = max(16, round(width * scale)), max(16, round(height * scale))
     scale = w / width
-    mask = np.stack([cv2.resize(m.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA) > 0.5 for m in full])
+    smaller = lambda x: cv2.resize(np.asarray(x, np.float32), (w, h), interpolation=cv2.INTER_AREA)  # noqa: E731
+    mask = np.stack([smaller(m) > 0.5 for m in full])
     K0 = np.asarray(camera["K"], float)
     # Pixel centres are at integers: (u + 1/2) scales, not u.
     K = Intrinsics(
         K0[0, 0] * scale, K0[1, 1] * scale, (K0[0, 2] + 0.5) * scale - 0.5, (K0[1, 2] + 0.5) * scale - 0.5, w, h
     )
-    fl, ok = _chain(flow, at, width)
-    fl = np.stack([cv2.resize(f, (w, h), interpolation=cv2.INTER_AREA) for f in fl]) * scale
-    ok = np.stack([cv2.resize(o.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA) > 0.7 for o in ok])
+    fl, ok = np.empty((len(at) - 1, h, w, 2), np.float32), np.empty((len(at) - 1, h, w), bool)
+    for i, (first, last) in enumerate(itertools.pairwise(at.tolist())):
+        total, sure = _chain(flow, first, last, (width, height))
+        fl[i], ok[i] = smaller(total) * scale, smaller(sure) > 0.7
     T_world_cam = np.asarray(camera["T_world_cam"], float)
     static = _static(K, T_world_cam[at], mask, fl, ok)
-    inside = np.stack([cv2.distanceTransform(m.astype(np.uint8), cv2.DIST_L2, 3) for m in mask])
-    outside = np.stack(
-        [cv2.distanceTransform((~m).astype(np.uint8), cv2.DIST_L2, 3) if m.any() else np.zeros((h, w)) for m in mask]
-    )
+    distance = lambda m: cv2.distanceTransform(m.astype(np.uint8), cv2.DIST_L2, 3)  # noqa: E731
+    inside = np.stack([distance(m) for m in mask])
+    outside = np.stack([distance(~m) if m.any() else np.zeros((h, w), np.float32) for m in mask])
     empty = np.array([not m.any() for m in mask])
     box = np.array([[0, 0, 0, 0] if not m.any() else _box(m) for m in mask], float)
     # Thin parts (legs) are drawn as often as thick ones; background is drawn near the subject and everywhere.
-    draw_in = _cumulative(np.where(mask, 1 / (1 + inside), 0))
-    near = np.where(mask, 0, np.exp(-outside / 4.0))
-    far = (~mask).astype(float)
-    total = lambda x: np.maximum(x.sum((1, 2), keepdims=True), 1e-9)  # noqa: E731
-    draw_out = _cumulative(0.65 * near / total(near) + 0.35 * far / total(far))
+    draw_in = _cumulative(m / (1 + i) for m, i in zip(mask, inside, strict=True))
+    draw_out = _cumulative(_beside(m, o) for m, o in zip(mask, outside, strict=True))
     size = np.linalg.norm(fl, axis=-1)[ok & mask[:-1]]
     f = lambda x: torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)  # noqa: E731
     flat = lambda x: torch.as_tensor(np.ascontiguousarray(x)).reshape(len(x), h * w, *x.shape[3:])  # noqa: E731
     return Observations(
         t=f(frames_t), at=torch.as_tensor(at), dt=f(np.diff(np.asarray(frames_t)[at])), K=K, scale=scale,
         T_world_cam=T_world_cam, mask=flat(mask), edge=f(outside - inside)[:, None], draw_in=draw_in, draw_out=draw_out,
-        flow=flat(fl.astype(np.float32)), flow_ok=flat(ok & mask[:-1]), static=f(static)[:, None],
+        flow=flat(fl), flow_ok=flat(ok & mask[:-1]), static=f(static)[:, None],
         quality=f(masks["quality"][at]) * f(~empty), box=box, empty=empty,
         flow_size=float(np.quantile(size, 0.5)) if len(size) else 1.0,
     )  # fmt: skip
@@ -127,27 +128,33 @@ def _box(m: Array) -> tuple[int, int, int, int]:
     return u[0], v[0], u[-1], v[-1]
 
 
-def _cumulative(p: Array) -> Tensor:
-    c = np.cumsum(p.reshape(len(p), -1), axis=1)
-    return torch.as_tensor(c / np.maximum(c[:, -1:], 1e-12))
+def _beside(mask: Array, outside: Array) -> Array:
+    near, far = np.where(mask, 0, np.exp(-outside / 4.0)), (~mask).astype(float)
+    return 0.65 * near / max(near.sum(), 1e-9) + 0.35 * far / max(far.sum(), 1e-9)
 
 
-def _chain(flow: Mapping[str, Array], at: Array, width: int) -> tuple[Array, Array]:
-    """Flow between consecutive fit frames, (F-1, H, W, 2) and (F-1, H, W): pixels are carried through those between."""
-    out, ok_out = [], []
-    for a, b in itertools.pairwise(at):
-        total = np.asarray(flow["flow"][a], np.float32)
-        h, w = total.shape[:2]
-        ok = np.unpackbits(flow["consistent"][a], axis=-1)[:, :width].astype(np.float32)
-        grid = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).astype(np.float32)
-        for k in range(a + 1, b):
-            at_k = grid + total
-            total = total + _at(np.asarray(flow["flow"][k], np.float32), at_k)
-            ok_k = np.unpackbits(flow["consistent"][k], axis=-1)[:, :width].astype(np.float32)
-            ok = ok * _at(ok_k, at_k)
-        out.append(total)
-        ok_out.append(ok > 0.5)
-    return np.stack(out), np.stack(ok_out)
+def _cumulative(weights: Iterable[Array]) -> Tensor:
+    """(F, n) float64 of F pictures of weights (h, w)."""
+    c = np.stack([np.cumsum(p.ravel(), dtype=float) for p in weights])
+    c /= np.maximum(c[:, -1:], 1e-12)
+    return torch.as_tensor(c)
+
+
+def _chain(flow: Mapping[str, Array], first: int, last: int, size: tuple[int, int]) -> tuple[Array, Array]:
+    """Flow between two frames, (H, W, 2) and whether it is sure (H, W): pixels are carried through those between."""
+    cells = flow["flow"].shape[2]
+
+    def sure(k: int) -> Array:
+        consistent = np.unpackbits(flow["consistent"][k], axis=-1)[:, :cells].astype(np.float32)
+        return cv2.resize(consistent, size, interpolation=cv2.INTER_NEAREST)
+
+    total, ok = spread(flow["flow"][first], size), sure(first)
+    grid = np.stack(np.meshgrid(np.arange(size[0]), np.arange(size[1])), -1).astype(np.float32)
+    for k in range(first + 1, last):
+        at_k = grid + total
+        total = total + _at(spread(flow["flow"][k], size), at_k)
+        ok = ok * _at(sure(k), at_k)
+    return total, ok > 0.5
 
 
 def _at(image: Array, uv: Array) -> Array:
@@ -166,7 +173,7 @@ def _static(K: Intrinsics, T_world_cam: Array, mask: Array, flow: Array, ok: Arr
     """How surely each mask pixel moves with the ground under it; the last fit frame repeats the one before."""
     F, h, w = mask.shape
     v, u = np.mgrid[:h, :w].astype(float)
-    out = np.zeros((F, h, w))
+    out = np.zeros((F, h, w), np.float32)
     for i in range(F - 1):
         X = ground_points(K, T_world_cam[i], u, v)
         Y = (X - T_world_cam[i + 1, :3, 3]) @ T_world_cam[i + 1, :3, :3]

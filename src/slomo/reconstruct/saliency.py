@@ -48,7 +48,9 @@ class SaliencySegmenter:
         repaired = _give_back_surroundings(frames, layers)
         progress(0.8)
         probability = blend_over_time(layers, flow, lambda f: progress(0.8 + 0.15 * f))
-        masks = np.stack([component_at(p > 0.5, p > 0.8) for p in probability])
+        masks = np.empty(frames.shape[:3], bool)
+        for t, p in enumerate(probability):
+            masks[t] = component_at(p > 0.5, p > 0.8)
         if not masks.any():
             raise no_subject("the network's answer does not hold over time")
         report = {"weights_sha256": self.network.digest, "network_frames": len(keys), "seed_frame": seed}
@@ -65,7 +67,7 @@ class SaliencySegmenter:
                 box = box_of(hint, margin=self.margin) if hint.sum() > 50 else (0, 0, hint.shape[1], hint.shape[0])
                 seen = self.network.crop(frames[t], box)
                 seen = seen * component_at(seen > 0.3, hint if hint.any() else None)
-            layers[t] = seen
+            layers[t] = seen.astype(np.float16)
             if (found := seen > 0.5).any():
                 hint = found
 
@@ -85,13 +87,13 @@ def _give_back_surroundings(frames: np.ndarray, layers: dict[int, np.ndarray]) -
     if len(trusted) < 2:
         return 0
     model = learn_colours(frames, {k: bodies[k] for k in trusted}, reach=2.0)
-    colour = {k: cv2.GaussianBlur(model(to_lab(frames[k])), (0, 0), 1.5) for k in layers}
-    swallowing = [k for k in area if _foreign(bodies[k], colour[k]) > _FOREIGN]
+    colour = lambda k: cv2.GaussianBlur(model(to_lab(frames[k])), (0, 0), 1.5)  # noqa: E731
+    swallowing = [k for k in area if _foreign(bodies[k], colour(k)) > _FOREIGN]
     for k in swallowing:
         # The network has shown here that it does not know, so colour outweighs it.
-        logit = 2.0 * (np.clip(colour[k], -2.0, 2.0) - 0.5) + layers[k] - 0.5
+        logit = 2.0 * (np.clip(colour(k), -2.0, 2.0) - 0.5) + layers[k] - 0.5
         probability = np.where(grown(bodies[k], 0.1), 1.0 / (1.0 + np.exp(-logit)), 0.0)
-        layers[k] = component_at(cut(frames[k], probability)).astype(np.float32)
+        layers[k] = component_at(cut(frames[k], probability)).astype(np.float16)
     if swallowing:
         left = {k: float((p > 0.5).sum()) for k, p in layers.items()}
         trusted_area = np.median([area[k] for k in trusted])

@@ -1,6 +1,6 @@
 """What every segmenter takes and returns, and the steps that they share."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -85,28 +85,29 @@ def grown(mask: np.ndarray, reach: float) -> np.ndarray:
     return cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
 
 
-def blend_over_time(layers: dict[int, np.ndarray], flow: Flow, progress: Report, *, neighbours: int = 2) -> np.ndarray:
-    """Probability (T, H, W) float32 of every frame from those of some frames.
+def blend_over_time(
+    layers: dict[int, np.ndarray], flow: Flow, progress: Report, *, neighbours: int = 2
+) -> Iterator[np.ndarray]:
+    """Probability (H, W) float32 of each frame in turn, from those of some frames.
 
     Each frame takes its nearest `neighbours` layers on either side (and its own), carries them along the flow, and
     averages them with weights falling with distance in time: this both fills the frames between and removes flicker.
     """
     T = len(flow.forward) + 1
     keys = np.array(sorted(layers))
-    out = np.empty((T, *flow.forward.shape[1:3]), np.float32)
+    shape = flow.size[::-1]
     spacing = max(1.0, float(np.median(np.diff(keys)))) if len(keys) > 1 else 1.0
     for t in range(T):
         order = keys[np.argsort(abs(keys - t), kind="stable")]
         used = [*order[order <= t][:neighbours], *order[order > t][:neighbours]]
-        total, weight = np.zeros(out.shape[1:], np.float32), np.full(out.shape[1:], 1e-6, np.float32)
+        total, weight = np.zeros(shape, np.float32), np.full(shape, 1e-6, np.float32)
         for k in used:
             offset = flow.chain(t, int(k))
             w = np.exp(-0.5 * ((t - k) / spacing) ** 2) * (0.05 + inside(offset)).astype(np.float32)
-            total += w * sample(layers[int(k)], offset)
+            total += w * sample(layers[int(k)].astype(np.float32), offset)
             weight += w
-        out[t] = total / weight
+        yield total / weight
         progress((t + 1) / T)
-    return out
 
 
 def frame_quality(masks: np.ndarray, flow: Flow) -> np.ndarray:

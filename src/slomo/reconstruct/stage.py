@@ -13,7 +13,7 @@ from slomo.reconstruct.video import decode
 from slomo.stage import Artifact, Inputs, Progress
 
 DECODE_VERSION = 1
-MASKS_VERSION = 1
+MASKS_VERSION = 2
 CAMERA_VERSION = 2
 
 SEGMENTERS = ("auto", "u2netp", "motion", "user")
