@@ -9,7 +9,7 @@ import pytest
 
 from slomo.errors import InvalidData, UsageError
 from slomo.reconstruct.stage import DecodeConfig, run_decode
-from slomo.reconstruct.video import decode
+from slomo.reconstruct.video import decode, fit_in
 from slomo.stage import Inputs, Silent
 
 
@@ -96,10 +96,32 @@ def test_long_side_is_bounded(tmp_path):
     assert clip.info["scale"] == pytest.approx(0.25)
 
 
-def test_long_clip_is_cut_and_said(tmp_path):
-    clip = decode(write_clip(tmp_path / "a.mp4", np.arange(40) / 30), max_frames=25)
-    assert len(clip.t) == 25
-    assert clip.info["frames_dropped"] == 15
+@pytest.mark.parametrize(("seconds", "every", "side"), [(60, 1, 640), (100, 2, 640), (200, 2, 498), (1000, 2, 320)])
+def test_long_clips_fit_in(seconds, every, side):
+    """4K at 30 frames a second: the rate is lowered first, then the size; only then is anything left out."""
+    got = fit_in(30 * seconds, 30.0, (3840, 2160), 640, 420.0)
+    assert got[:2] == (every, side)
+    assert got[2] * side**2 * 9 / 16 <= 420e6
+    assert got[2] == 15 * seconds * (3 - every) or (side == 320 and got[2] < 15 * seconds)
+
+
+def test_a_slow_source_is_not_thinned_below_what_a_stride_needs():
+    assert fit_in(25 * 600, 25.0, (1280, 720), 640, 420.0)[0] == 2
+    assert fit_in(20 * 600, 20.0, (1280, 720), 640, 420.0)[0] == 1
+    assert fit_in(100, 30.0, (320, 240), 640, 420.0) == (1, 640, 100)
+
+
+def test_long_clip_is_thinned_and_said(tmp_path):
+    path = write_clip(tmp_path / "a.mp4", np.arange(60) / 30)
+    clip = decode(path, megapixels=0.2)
+    assert clip.info["every"] == 2
+    assert len(clip.t) == 30
+    assert clip.info["frames_dropped"] == 0
+    np.testing.assert_allclose(np.diff(clip.t), 1 / 15, rtol=1e-6)
+    np.testing.assert_allclose(level(clip.frames), clip.t, atol=0.06)
+    short = decode(path, megapixels=0.06)
+    assert len(short.t) * short.frames[0, ..., 0].size <= 60_000
+    assert short.info["frames_dropped"] == 30 - len(short.t)
 
 
 def _message(path, **options) -> str:

@@ -12,7 +12,7 @@ from slomo.errors import UsageError
 from slomo.reconstruct.video import decode
 from slomo.stage import Artifact, Inputs, Progress
 
-DECODE_VERSION = 1
+DECODE_VERSION = 2
 MASKS_VERSION = 2
 CAMERA_VERSION = 2
 
@@ -28,14 +28,15 @@ class DecodeConfig:
         duration: s; 0 takes everything to the end.
         fps: frames per second at most; a slower clip keeps its own rate.
         max_side: px, the longer side of the decoded frames at most.
-        max_frames: bound on memory; what a longer clip has more is left out, and said.
+        megapixels: million pixels of all frames together, the bound on memory (about 7 bytes each): a longer clip is
+            taken at a half or less of its rate, then smaller, and what is still too much is left out, which is said.
     """
 
     start: float = 0.0
     duration: float = 0.0
     fps: float = 30.0
     max_side: int = 640
-    max_frames: int = 900
+    megapixels: float = 420.0
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ def run_decode(inputs: Inputs, config: DecodeConfig, progress: Progress) -> Arti
         InvalidData: the file is no video, or too little of it can be decoded.
         UsageError: a parameter is out of its range.
     """
-    for name, least in (("start", 0.0), ("duration", 0.0), ("fps", 1.0), ("max_side", 64), ("max_frames", 8)):
+    for name, least in (("start", 0.0), ("duration", 0.0), ("fps", 1.0), ("max_side", 64), ("megapixels", 1.0)):
         if not getattr(config, name) >= least:
             raise UsageError(f"is {getattr(config, name)}", where=f"decode.{name}", valid=[f"{least:g} and more"])
     clip = decode(
@@ -90,13 +91,20 @@ def run_decode(inputs: Inputs, config: DecodeConfig, progress: Progress) -> Arti
         duration=config.duration,
         fps=config.fps,
         max_side=config.max_side,
-        max_frames=config.max_frames,
+        megapixels=config.megapixels,
         progress=lambda f: progress.update(f, "decoding"),
     )
     if lost := clip.info["frames_lost"]:
         progress.note(f"decode: the clip is damaged or cut off: {lost} frames are lost, {len(clip.t)} are used")
+    if clip.info["every"] > 1:
+        progress.note(f"decode: the clip is long: it is taken at {clip.info['fps']:.3g} frames a second")
+    if clip.info["max_side"] < config.max_side:
+        progress.note(
+            f"decode: the clip is very long: its frames are {clip.info['max_side']} px, not {config.max_side}"
+        )
     if dropped := clip.info["frames_dropped"]:
-        progress.note(f"decode: the clip is long: the last {dropped} frames are left out (choose with start, duration)")
+        seconds = dropped / clip.info["fps"]
+        progress.note(f"decode: the clip is too long: its last {seconds:.0f} s are left out (see start, duration)")
     return Artifact(npz={"frames.npz": {"frames": clip.frames, "t": clip.t}}, json={"video.json": clip.info})
 
 

@@ -12,6 +12,8 @@ import numpy as np
 from slomo.errors import InvalidData
 
 MIN_FRAMES = 8
+LEAST_FPS = 12.0  # frames a second of a clip that is too long to take more of: five of the fastest stride
+LEAST_SIDE = 320  # px, likewise
 _DIAGONAL_35MM = 43.267  # mm, diagonal of the full frame that "35 mm equivalent" focal lengths refer to
 _FOCAL_TAG = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
 
@@ -38,7 +40,7 @@ def decode(
     duration: float = 0.0,
     fps: float = 30.0,
     max_side: int = 640,
-    max_frames: int = 900,
+    megapixels: float = 420.0,
     progress=lambda fraction: None,
 ) -> Clip:
     """Decode `path`, resampling to at most `fps` by the nearest source frame and shrinking to `max_side` px.
@@ -47,7 +49,7 @@ def decode(
         start: s from the clip's first frame.
         duration: s; 0 means up to the end.
         fps: upper bound of the frame rate; a slower source keeps its own.
-        max_frames: bound on memory; the rest of a longer clip is dropped and `info["frames_dropped"]` says how much.
+        megapixels: million pixels of all frames together, the bound on memory; see `fit_in`.
 
     Raises:
         InvalidData: the file is no video, holds no frame in the wanted span, or fewer than 8.
@@ -68,8 +70,6 @@ def decode(
     stop = min(length, start + duration) if duration > 0 else length
     wanted = int(np.floor((stop - start) * rate + 1e-6)) if stop > start else 0
     _require_enough(wanted, path, f"the clip lasts {length:.2f} s, {max(stop - start, 0):.2f} s of it were asked for")
-    dropped = max(0, wanted - max_frames)
-    grid = start + np.arange(wanted - dropped) / rate
 
     with closing(_open(path)) as container:
         stream = container.streams.video[0]
@@ -77,7 +77,10 @@ def decode(
         if start > 1.0:  # land on the key frame before the start
             container.seek(int((float(pts[0]) + start - 0.5) / float(stream.time_base or 1)), stream=stream)
         aspect = float(stream.sample_aspect_ratio or 0) or 1.0
-        stack, count, rotation = _fill(grid, _frames(stream, float(pts[0])), 1.0 / rate, aspect, max_side, progress)
+        every, side, kept = fit_in(wanted, rate, (stream.width * aspect, stream.height), max_side, megapixels)
+        rate /= every
+        grid = start + np.arange(kept) / rate
+        stack, count, rotation = _fill(grid, _frames(stream, float(pts[0])), 1.0 / rate, aspect, side, progress)
     _require_enough(count, path, f"only {count} frames could be decoded")
     lost = stamps_lost + len(grid) - count
     stack = stack[:count]
@@ -89,13 +92,39 @@ def decode(
         "rotation": rotation,
         "frames_total": len(stack),
         "frames_lost": int(lost),
-        "frames_dropped": dropped,
+        "frames_dropped": (wanted + every - 1) // every - kept,
+        "every": every,
+        "max_side": side,
         "start_s": start,
         "scale": float(max(stack.shape[1:3]) / max(info["source_width"], info["source_height"])),
     }
     if info["focal_35mm"]:
         info["focal_px_hint"] = info["focal_35mm"] / _DIAGONAL_35MM * float(np.hypot(*stack.shape[1:3]))
     return Clip(stack, np.arange(len(stack)) / rate, info)
+
+
+def fit_in(
+    frames: int, rate: float, size: tuple[float, float], max_side: int, megapixels: float
+) -> tuple[int, int, int]:
+    """What is taken of a long clip: every n-th frame first, though no fewer than `LEAST_FPS` a second; then smaller
+    frames, though no smaller than `LEAST_SIDE`; what is still too much is left out at the end.
+
+    Args:
+        frames: wanted, `rate` of them a second.  size: px, of the source, width and height.
+
+    Returns:
+        n, the longer side in px at most, and the number of frames.
+    """
+    budget, longer = 1e6 * megapixels, max(size)
+    flat = min(size) / longer
+    area = lambda side: flat * min(side, longer) ** 2  # noqa: E731
+    most = max(1, int(rate / LEAST_FPS))
+    every = next((n for n in range(1, most) if -(-frames // n) * area(max_side) <= budget), most)
+    taken = -(-frames // every)
+    if taken * area(max_side) <= budget:
+        return every, max_side, taken
+    side = min(max_side, max(LEAST_SIDE, int(np.sqrt(budget / (taken * flat)))))
+    return every, side, min(taken, max(MIN_FRAMES, int(budget / area(side))))
 
 
 def _require_enough(count: int, path: Path, why: str) -> None:

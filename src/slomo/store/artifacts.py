@@ -34,7 +34,8 @@ SCHEMA = 1
 
 
 class _Folder(Mapping[str, Any]):
-    """Files of an artifact, read when they are asked for, so that nobody pays for what he does not use."""
+    """Files of an artifact, or arrays of a file, read when they are asked for, so that nobody pays for what he does not
+    use: the times of a clip's frames are a thousandth of a file that may hold a gigabyte."""
 
     def __init__(self, folder: Path, names: list[str], read: Callable[[Path], Any]):
         self._folder, self._names, self._read, self._have = folder, names, read, {}
@@ -55,7 +56,13 @@ class _Folder(Mapping[str, Any]):
 
 def _read_npz(path: Path) -> Arrays:
     with np.load(path, allow_pickle=False) as z:
-        return {k: z[k] for k in z.files}
+        names = list(z.files)
+    return _Folder(path, names, _read_array)
+
+
+def _read_array(place: Path) -> np.ndarray:
+    with np.load(place.parent, allow_pickle=False) as z:
+        return z[place.name]
 
 
 class Store:
