@@ -5,25 +5,11 @@
 # pyright: reportAttributeAccessIssue=false, reportReturnType=false, reportInvalidTypeForm=false
 # pyright: reportGeneralTypeIssues=false
 
-import os
-
 import warp as wp
 
+from slomo import quiet_warp
 
-def _init_quietly() -> None:
-    """Start Warp without its greeting, nor its library's warning of a missing GPU driver: the CPU serves as well."""
-    wp.config.log_level = wp.LOG_ERROR
-    stderr, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null, 2)
-    try:
-        wp.init()
-    finally:
-        os.dup2(stderr, 2)
-        os.close(stderr)
-        os.close(null)
-
-
-_init_quietly()
+quiet_warp.init()
 wp.set_module_options({"enable_backward": False})
 
 
