@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
+from slomo.mesh import vertex_normals
 from slomo.raycast_kernel import LightStruct, cast
 
 SKY, GROUND = -1, 0  # ids of what is no part
@@ -98,14 +99,6 @@ class _Hits(NamedTuple):
 
 def _linear(srgb) -> np.ndarray:
     return np.asarray(srgb, np.float32) ** 2.2
-
-
-def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """(V, 3) area-weighted vertex normals."""
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    face = np.cross(b - a, c - a)
-    out = np.stack([np.bincount(triangles.ravel(), np.repeat(face[:, k], 3), len(vertices)) for k in range(3)], 1)
-    return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-20)
 
 
 class Scene:

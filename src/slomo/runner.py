@@ -19,7 +19,7 @@ from slomo.console import Console
 from slomo.errors import InvalidData, MissingInput, StageFailed, UsageError
 from slomo.pipeline import STAGES, Identity, Project
 from slomo.progress import RunProgress, Signals
-from slomo.stage import Inputs
+from slomo.stage import Artifact, Inputs
 from slomo.status import State, states
 from slomo.store import Manifest
 from slomo.store.lock import command_line
@@ -123,16 +123,24 @@ class Runner:
         found = states(self.project, stage)
         inspects = STAGES[stage].inspects
         needed = {n: found[n] for n in self.project.upstream(stage)}
-        for state in needed.values():
-            if state.status != "current" and not (inspects and state.status == "failed"):
-                raise self._missing(stage, state, found)
-        for name, state in needed.items():
-            if state.key and (bad := self.project.store.damaged(name, state.key)):
-                self.project.store.discard(name, state.key)
-                raise MissingInput(
-                    f"the stored artifact was damaged ({bad})", where=name, todo=f"run `{state.command}`"
-                )
-        return {name: s.manifest for name, s in needed.items() if s.manifest}
+        return {n: self._check(s, found, wanted_by=stage, inspects=inspects) for n, s in needed.items()}
+
+    def current(self, stage: str, *, wanted_by: str) -> Artifact:
+        """The stage's artifact that is there. Raises `MissingInput` as `make_only`."""
+        found = states(self.project, stage)
+        return self.project.store.load(self._check(found[stage], found, wanted_by=wanted_by))
+
+    def _check(self, state: State, found: Mapping[str, State], *, wanted_by: str, inspects: bool = False) -> Manifest:
+        """The manifest of an artifact that is current, or, with `inspects`, failed. Raises `MissingInput`."""
+        fit = state.status == "current" or (inspects and state.status == "failed")
+        if state.manifest is None or not fit:
+            raise self._missing(wanted_by, state, found)
+        if state.key and (bad := self.project.store.damaged(state.stage, state.key)):
+            self.project.store.discard(state.stage, state.key)
+            raise MissingInput(
+                f"the stored artifact was damaged ({bad})", where=state.stage, todo=f"run `{state.command}`"
+            )
+        return state.manifest
 
     def _missing(self, stage: str, state: State, found: Mapping[str, State]) -> MissingInput:
         """`state` and the first thing before it that is not current, which is why."""

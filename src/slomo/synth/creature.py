@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from slomo.flesh import Cone, mesh, value_noise
+from slomo.mesh import vertex_normals
 from slomo.prior.labels import labels
-from slomo.raycast import vertex_normals
 from slomo.skeleton import Skeleton
 from slomo.synth.coat import coat
 from slomo.synth.variety import Build, build, extras
