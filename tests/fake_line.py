@@ -17,7 +17,7 @@ from slomo import pipeline
 from slomo.errors import InvalidData, UsageError
 from slomo.stage import Artifact, Inputs, Progress
 
-DECODE_VERSION = MASKS_VERSION = CAMERA_VERSION = FIT_VERSION = VERSION = 1
+DECODE_VERSION = MASKS_VERSION = CAMERA_VERSION = FIT_VERSION = REFINE_VERSION = VERSION = 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +47,11 @@ class FitConfig:
     def __post_init__(self):
         if self.iterations < 1:
             raise UsageError(f"iterations = {self.iterations}: expected at least 1")
+
+
+@dataclasses.dataclass(frozen=True)
+class ReconstructConfig(FitConfig):
+    quality: str = "normal"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,7 +114,11 @@ def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
         while i == config.iterations // 2 and not Path(os.environ.get("FAKE_GATE", ".")).exists():
             time.sleep(0.02)
             progress.update(i / config.iterations, "waiting at the gate")
-    t = np.arange(5) / 30
+    return Artifact(npz={"fit.npz": {"x": x}}, json={"report.json": {"iterations": i}})
+
+
+def run_refine(inputs: Inputs, config: ReconstructConfig, progress: Progress) -> Artifact:
+    x, t = inputs.artifacts["fit"].npz["fit.npz"]["x"], np.arange(5) / 30
     arrays = {"t": t, "keypoints": np.tile(x[:3], (5, 2, 1)), "keypoint_names": np.array(["a", "b"])}
     return Artifact(npz={"keypoints.npz": arrays}, json={"report.json": {"length": config.length_m}})
 

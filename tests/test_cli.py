@@ -96,7 +96,7 @@ def test_every_command_of_the_line(project):
     assert path(run("report", "--robot", "go1")).parent.name == "report"
     assert path(run("run", "--robot", "a1", "--duration", "0")).parent.name == "report"
     assert {p.name for p in (project / "out").iterdir()} == {
-        *(f"{s}.json" for s in ("decode", "masks", "camera", "evidence", "reconstruct")),
+        *(f"{s}.json" for s in ("decode", "masks", "camera", "evidence", "fit", "reconstruct")),
         *(f"{s}-{r}.json" for s in ("retarget", "optimize", "track", "report") for r in ("go1", "a1")),
     }
 
@@ -106,7 +106,7 @@ def test_json_is_the_manifest(project):
     m = json.loads(done.stdout)
     assert m == json.loads((project / m["directory"] / "manifest.json").read_text())
     listed = json.loads(run("status", "--json").stdout)["stages"]
-    assert [s["status"] for s in listed] == ["current"] * 5
+    assert [s["status"] for s in listed] == ["current"] * 6
     assert listed[4]["manifest"]["seconds"] >= 0
     assert json.loads(run("init", "--json").stdout)["new"] is False
     assert json.loads(run("gc", "--json").stdout) == {"dry_run": False, "bytes": 0, "removed": []}
@@ -172,7 +172,7 @@ def test_masks_given_are_used(project):
         ("[decode]\nstrat = 1.0", "[decode]: no parameter 'strat' (valid: start, duration); did you mean 'start'?"),
         (
             "[decoed]\nstart = 1.0",
-            "no section 'decoed' (valid: inputs, decode, masks, camera, evidence, reconstruct",
+            "no section 'decoed' (valid: inputs, decode, masks, camera, evidence, fit, reconstruct",
         ),
         ("[decode]\nstart = 'soon'", "[decode]: start = 'soon': expected a valid number"),
         ("[reconstruct]\niterations = 2.5", "iterations = 2.5: expected a valid integer"),
@@ -312,10 +312,7 @@ def test_status_says_why(project):
     (project / "slomo.toml").write_text(
         (project / "slomo.toml").read_text().replace("# length_m = 0.5", "length_m = 0.75")
     )
-    assert (
-        "reconstruct        stale\n    [reconstruct] length_m changed: 0.5 -> 0.75\n    run `slomo reconstruct`"
-        in why()
-    )
+    assert "fit                stale\n    [fit] length_m changed: 0.5 -> 0.75\n    run `slomo reconstruct`" in why()
     assert "retarget-go1       stale\n    reconstruct is stale\n    run `slomo retarget --robot go1`" in why()
     run("run", "--robot", "go1", "--set", "reconstruct.length_m=0.5")
     (project / "clip.txt").write_text("b")
@@ -333,7 +330,7 @@ def test_gc_keeps_what_is_used(project):
     would = run("gc", "--dry-run")
     assert "would free" in would.stderr
     assert {line.split("/")[2] for line in would.stdout.splitlines()} == {
-        "decode", "masks", "camera", "evidence", "reconstruct", "report",
+        "decode", "masks", "camera", "evidence", "fit", "reconstruct", "report",
     }  # fmt: skip
     assert run("gc").stdout == would.stdout
     assert run("gc").stdout == "\n"

@@ -9,18 +9,19 @@ import torch
 from slomo.errors import InvalidData, UsageError
 from slomo.motion import KeypointMotion
 from slomo.reconstruct import hypotheses, silhouette
-from slomo.reconstruct.fit_stage import FitConfig, run_fit
+from slomo.reconstruct.fit_stage import run_fit
 from slomo.reconstruct.hypotheses import GaitHypothesis
 from slomo.reconstruct.kinematics import Kinematics
+from slomo.reconstruct.refine_stage import ReconstructConfig, run_refine
 from slomo.reconstruct.silhouette import Intrinsics
 from slomo.rotation import umeyama
 from slomo.skeleton import load_skeleton
-from slomo.stage import Artifact, Inputs, Silent
+from slomo.stage import Artifact, Inputs, Progress, Silent
 
 T, FPS, LENGTH = 24, 12.0, 0.45
 K = Intrinsics(150, 150, 79.5, 44.5, 160, 90)
-QUICK = FitConfig(iterations=(40, 40, 20, 120), candidates=4, gait_phases=6, fps=12)
-TINY = FitConfig(iterations=(6, 4, 4, 6), candidates=3, gait_phases=2, fps=6)
+QUICK = ReconstructConfig(quality="draft", iterations=(40, 40, 20, 120), candidates=4, gait_phases=6, fps=12)
+TINY = ReconstructConfig(quality="draft", iterations=(6, 4, 4, 6), candidates=3, gait_phases=2, fps=6)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -89,6 +90,12 @@ def _inputs(masks: dict, flow: dict) -> Inputs:
     )
 
 
+def reconstruct(inputs: Inputs, config: ReconstructConfig, progress: Progress) -> Artifact:
+    """The coarse fit, which may be interrupted, and what is made of it."""
+    fitted = run_fit(inputs, config, progress)
+    return run_refine(Inputs(artifacts={**inputs.artifacts, "fit": fitted}), config, Silent())
+
+
 @pytest.fixture(scope="module")
 def walk() -> tuple[np.ndarray, dict, dict]:
     return _walk()
@@ -96,7 +103,7 @@ def walk() -> tuple[np.ndarray, dict, dict]:
 
 def test_a_walk_is_found(walk):
     true, masks, flow = walk
-    out = run_fit(_inputs(masks, flow), QUICK, Silent())
+    out = reconstruct(_inputs(masks, flow), QUICK, Silent())
     assert out.failure is None
     report = out.json["report.json"]
     assert report["hypothesis"]["gait"] == "walk"
@@ -141,11 +148,11 @@ class Stops(Silent):
 @pytest.mark.parametrize("saves", [1, 5])
 def test_an_interrupted_fit_resumes_to_the_same_bits(walk, saves: int):
     _, masks, flow = walk
-    whole = run_fit(_inputs(masks, flow), TINY, Silent())
+    whole = reconstruct(_inputs(masks, flow), TINY, Silent())
     first = Stops(saves)
     with pytest.raises(KeyboardInterrupt):
-        run_fit(_inputs(masks, flow), TINY, first)
-    again = run_fit(_inputs(masks, flow), TINY, Stops(99, first.saved))
+        reconstruct(_inputs(masks, flow), TINY, first)
+    again = reconstruct(_inputs(masks, flow), TINY, Stops(99, first.saved))
     for k, v in whole.npz["keypoints.npz"].items():
         np.testing.assert_array_equal(again.npz["keypoints.npz"][k], v, err_msg=k)
     assert again.json["report.json"]["search"] == whole.json["report.json"]["search"]
@@ -154,7 +161,7 @@ def test_an_interrupted_fit_resumes_to_the_same_bits(walk, saves: int):
 def test_the_same_seed_gives_the_same_bits_and_another_seed_others(walk):
     _, masks, flow = walk
     a, b, c = (
-        run_fit(_inputs(masks, flow), dataclasses.replace(TINY, seed=s), Silent()).npz["keypoints.npz"]["keypoints"]
+        reconstruct(_inputs(masks, flow), dataclasses.replace(TINY, seed=s), Silent()).npz["keypoints.npz"]["keypoints"]
         for s in (1, 1, 2)
     )
     np.testing.assert_array_equal(a, b)
@@ -163,7 +170,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_others(walk):
 
 def test_a_length_sets_the_scale(walk):
     _, masks, flow = walk
-    a, b = (run_fit(_inputs(masks, flow), dataclasses.replace(TINY, length_m=m), Silent()) for m in (0.0, 1.0))
+    a, b = (reconstruct(_inputs(masks, flow), dataclasses.replace(TINY, length_m=m), Silent()) for m in (0.0, 1.0))
     ratio = b.npz["keypoints.npz"]["keypoints"] / a.npz["keypoints.npz"]["keypoints"]
     assert np.median(ratio) == pytest.approx(2.0, rel=0.02)
     assert b.json["report.json"]["scale_source"] == "length_m"
@@ -173,7 +180,7 @@ def test_masks_of_something_else_fail(walk):
     _, masks, flow = walk
     junk = np.zeros((T, 90, 160), bool)
     junk[:, 10:80:9, ::3] = True
-    out = run_fit(_inputs(masks | dict(packed=np.packbits(junk, axis=-1)), flow), TINY, Silent())
+    out = reconstruct(_inputs(masks | dict(packed=np.packbits(junk, axis=-1)), flow), TINY, Silent())
     assert out.failure
     assert "covers the subject badly" in out.failure
 
@@ -181,17 +188,19 @@ def test_masks_of_something_else_fail(walk):
 def test_parts_that_disagree_are_refused(walk):
     _, masks, flow = walk
     with pytest.raises(InvalidData, match="disagree about the number of frames"):
-        run_fit(_inputs(masks, dict(flow, flow=flow["flow"][:-2])), TINY, Silent())
+        reconstruct(_inputs(masks, dict(flow, flow=flow["flow"][:-2])), TINY, Silent())
 
 
 def test_no_subject_is_refused(walk):
     _, masks, flow = walk
     with pytest.raises(InvalidData, match="no frame shows the subject"):
-        run_fit(_inputs(masks | dict(packed=np.zeros_like(masks["packed"])), flow), TINY, Silent())
+        reconstruct(_inputs(masks | dict(packed=np.zeros_like(masks["packed"])), flow), TINY, Silent())
 
 
 def test_wrong_parameters():
     with pytest.raises(UsageError, match="length_m"):
-        FitConfig(length_m=-1)
+        ReconstructConfig(length_m=-1)
     with pytest.raises(UsageError, match="iterations"):
-        FitConfig(iterations=(1, 2))
+        ReconstructConfig(iterations=(1, 2))
+    with pytest.raises(UsageError, match="draft, normal, high"):
+        ReconstructConfig(quality="best")

@@ -20,6 +20,7 @@ CLIP = Path(str(files("slomo"))) / "assets" / "walk" / "clip.mp4"
 COMMANDS = {
     "masks": ["reconstruct"],
     "camera": ["reconstruct"],
+    "fit": ["reconstruct"],
     "reconstruct": ["reconstruct"],
     "retarget": ["retarget", "--robot", "go1"],
     "optimize": ["optimize", "--robot", "go1"],
@@ -171,7 +172,7 @@ def test_two_at_once(undisturbed, tmp_path):
     assert second.wait() == 0
     texts = [p.read_text() for p in project.glob("said-*")]
     assert len(texts) == 2
-    for stage in ("decode", "masks", "camera", "evidence", "reconstruct"):
+    for stage in ("decode", "masks", "camera", "evidence", "fit", "reconstruct"):
         assert sum(f"{stage}: done in" in text for text in texts) == 1, texts
         assert sum(f"{stage}: cached" in text for text in texts) == 1, texts
         assert differing(content(project, stage), content(undisturbed, stage)) == [], stage

@@ -17,7 +17,7 @@ import fake_line
 from slomo import pipeline, settings
 from slomo.cli import app
 from slomo.errors import MissingInput, UsageError
-from slomo.pipeline import STAGES, Project
+from slomo.pipeline import ALL, STAGES, Project
 from slomo.template import template
 
 HERE = Path(__file__).parent
@@ -54,7 +54,7 @@ def start(*args, gate=None):
 def wait_for_gate(project: Path, process: subprocess.Popen) -> None:
     """Wait until the fit is half done: at its 10th iteration and 5th checkpoint."""
     for _ in range(3000):
-        if list(project.glob(".slomo/partial/reconstruct/*/checkpoints/000005.json")):
+        if list(project.glob(".slomo/partial/fit/*/checkpoints/000005.json")):
             return
         assert process.poll() is None, process.communicate()
         time.sleep(0.02)
@@ -72,7 +72,7 @@ def test_the_table_names_what_there_is():
 
 
 def test_every_option_of_reconstruct_is_a_parameter():
-    stages = ("decode", "masks", "camera", "evidence", "reconstruct")
+    stages = ("decode", "masks", "camera", "evidence", "fit", "reconstruct")
     parameters = {s: STAGES[s].of_module(STAGES[s].config) for s in stages}
     for stage, name in [
         ("decode", "start"),
@@ -87,7 +87,7 @@ def test_every_option_of_reconstruct_is_a_parameter():
 
 
 def test_a_new_projects_file_is_read_back_as_the_defaults(tmp_path):
-    text = template({s.name: (s.module, s.config) for s in STAGES.values()})
+    text = template({s.name: (s.module, s.config) for s in STAGES.values() if s.shares != ALL})
     (tmp_path / settings.FILE).write_text(text)
     assert not any(settings.read(tmp_path, list(STAGES)).values())
     uncommented = "\n".join(line.removeprefix("# ") for line in text.splitlines()[2:])
@@ -107,7 +107,7 @@ def test_where_the_key_points_come_from(tmp_path):
     with pytest.raises(MissingInput, match="no motion yet; run `slomo reconstruct CLIP` or `slomo import KEYPOINTS`"):
         write_inputs(tmp_path).chain("retarget")
     assert write_inputs(tmp_path, clip="a.mp4").chain("retarget") == [
-        "decode", "masks", "camera", "evidence", "reconstruct", "retarget",
+        "decode", "masks", "camera", "evidence", "fit", "reconstruct", "retarget",
     ]  # fmt: skip
     assert write_inputs(tmp_path, keypoints="a.json").chain("report") == [
         "import", "retarget", "optimize", "track", "report",
@@ -160,7 +160,7 @@ def test_everything_is_cached_the_second_time(project):
     assert (entry / "side_by_side.mp4").read_bytes() == stages
     again = slomo("run", "--robot", "go1", check=0)
     assert again.stdout == first.stdout
-    assert again.stderr.count(": cached") == 9
+    assert again.stderr.count(": cached") == 10
     assert "done in" not in again.stderr
 
 
@@ -182,15 +182,16 @@ def test_kill_in_the_middle_then_the_same_command_gives_the_same_bits(project, t
     run.send_signal(signal.SIGKILL)
     run.communicate()
     status = slomo("status", "--why", check=0).stdout
-    assert "reconstruct        interrupted at" in status
+    assert "fit                interrupted at" in status
     assert "goes on from there" in status
     resumed = slomo("reconstruct", "clip.txt", check=0)
-    assert "reconstruct: goes on from 50 %" in resumed.stderr
+    assert "fit: goes on from 50 %" in resumed.stderr
     a, b = (Path(r.stdout.strip()) for r in (undisturbed, resumed))
     assert a.name == b.name
     assert a != b
     assert (a / "keypoints.npz").read_bytes() == (b / "keypoints.npz").read_bytes()
-    assert json.loads((b / "manifest.json").read_text())["resumed_at"] == 0.5
+    (fitted,) = (project / ".slomo" / "store" / "fit").iterdir()
+    assert json.loads((fitted / "manifest.json").read_text())["resumed_at"] == 0.5
     assert not list(project.glob(".slomo/partial/*/*"))
 
 
@@ -221,21 +222,21 @@ def test_two_processes_one_works_the_other_waits_and_reuses(project):
     first = start("reconstruct", "clip.txt", gate=project / "gate")
     wait_for_gate(project, first)
     status = slomo("status", "--why", check=0).stdout
-    assert f"reconstruct        running\n    pid {first.pid}, `fake_line.py reconstruct clip.txt`" in status
+    assert f"fit                running\n    pid {first.pid}, `fake_line.py reconstruct clip.txt`" in status
     refused = slomo("reconstruct", "--no-wait", check=75)
-    assert f"reconstruct is being made by pid {first.pid}, `fake_line.py reconstruct clip.txt`" in refused.stderr
+    assert f"fit is being made by pid {first.pid}, `fake_line.py reconstruct clip.txt`" in refused.stderr
     second = start("reconstruct")
     told = ""
     while "waiting for" not in told:
         told = second.stderr.readline()
         assert told, "the second process did not wait"
-    assert told.startswith(f"waiting for reconstruct: pid {first.pid}")
+    assert told.startswith(f"waiting for fit: pid {first.pid}")
     (project / "gate").touch()
     out, err = first.communicate()
     out_second, err_second = second.communicate()
     assert (first.returncode, second.returncode) == (0, 0)
-    assert "reconstruct: done in" in err
-    assert "reconstruct: cached" in err_second
+    assert "fit: done in" in err
+    assert "fit: cached" in err_second
     assert out == out_second
 
 

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from slomo.robot import Robot
 
 
+ALL = ("*",)
+
+
 @dataclass(frozen=True)
 class StageSpec:
     """One row of the table.
@@ -27,7 +30,7 @@ class StageSpec:
         files: roles of the user's files that it takes (see `settings.INPUTS`); `optional` ones where they are given.
         robot: whether it takes the robot.
         inspects: whether it also takes an artifact that failed, to show it.
-        shares: parameters that are those of `reconstruct` unless its own section sets them.
+        shares: parameters that are those of `reconstruct` unless its own section sets them; `ALL` of them.
         command: what the user types to make its artifact.
     """
 
@@ -83,8 +86,12 @@ STAGES: dict[str, StageSpec] = {
             optional=("skeleton", "prior", "keypoints2d", "keypoint_model", "keypoint_map"),
         ),
         StageSpec(
-            "reconstruct", "slomo.reconstruct.fit_stage", "reconstruct", "run_fit", "FitConfig", "FIT_VERSION",
-            ("decode", "masks", "camera", "evidence"), optional=("skeleton",),
+            "fit", "slomo.reconstruct.fit_stage", "reconstruct", "run_fit", "FitConfig", "FIT_VERSION",
+            ("decode", "masks", "camera", "evidence"), optional=("skeleton",), shares=ALL,
+        ),
+        StageSpec(
+            "reconstruct", "slomo.reconstruct.refine_stage", "reconstruct", "run_refine", "ReconstructConfig",
+            "REFINE_VERSION", ("decode", "masks", "camera", "evidence", "fit"), optional=("skeleton",),
         ),
         StageSpec(
             "import", "slomo.pipeline", "import", "run_import", "ImportConfig", "IMPORT_VERSION", (), ("keypoints",)
@@ -98,7 +105,7 @@ STAGES: dict[str, StageSpec] = {
         ),
     )
 }  # fmt: skip
-_FROM_CLIP = ("decode", "masks", "camera", "evidence", "reconstruct")
+_FROM_CLIP = ("decode", "masks", "camera", "evidence", "fit", "reconstruct")
 
 
 def load_robot(name_or_path: str) -> "Robot":
@@ -220,9 +227,11 @@ class Project:
         """The stage's parameters: its defaults and slomo.toml over them. Raises `UsageError`."""
         where = f"{self.root / settings.FILE} [{stage}]"
         table = self.tables.get(stage, {})
+        record = STAGES[stage].of_module(STAGES[stage].config)
         if shares := STAGES[stage].shares:
-            table = {name: getattr(self.config("reconstruct"), name) for name in shares} | table
-        return settings.make(STAGES[stage].of_module(STAGES[stage].config), table, where=where)
+            names = [f.name for f in dataclasses.fields(record)] if shares == ALL else shares
+            table = {name: getattr(self.config("reconstruct"), name) for name in names} | table
+        return settings.make(record, table, where=where)
 
     def files(self, stage: str) -> dict[str, Path]:
         """Role -> the user's file that the stage takes. Raises `MissingInput` for one that is needed."""

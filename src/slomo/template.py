@@ -27,12 +27,16 @@ def template(records: Mapping[str, tuple[str, str]]) -> str:
 
 
 def _entries(module: str, name: str) -> list[tuple[str, Any, str]]:
-    """Name, default and description of a record's fields, from its source."""
+    """Name, default and description of a record's fields, from its source; those of a record it extends first."""
     spec = importlib.util.find_spec(module)
     if spec is None or spec.origin is None:
         raise ModuleNotFoundError(f"no module {module}")
     source = Path(spec.origin).read_text()
-    record = next(n for n in ast.parse(source).body if isinstance(n, ast.ClassDef) and n.name == name)
+    body = ast.parse(source).body
+    record = next(n for n in body if isinstance(n, ast.ClassDef) and n.name == name)
+    named = {base.id for base in record.bases if isinstance(base, ast.Name)}
+    froms = {a.name: n.module for n in body if isinstance(n, ast.ImportFrom) for a in n.names}
+    inherited = [entry for base in named for entry in _entries(froms.get(base) or module, base)]
     fields = {
         n.target.id: n.value
         for n in record.body
@@ -43,7 +47,8 @@ def _entries(module: str, name: str) -> list[tuple[str, Any, str]]:
     for field, value in fields.items():
         if comment := lines[(value.end_lineno or 1) - 1][value.end_col_offset :].partition("#")[2].strip():
             about[field] = comment
-    return [(field, ast.literal_eval(value), about.get(field, "")) for field, value in fields.items()]
+    own = [(field, ast.literal_eval(value), about.get(field, "")) for field, value in fields.items()]
+    return inherited + own
 
 
 def _described(docstring: str, fields: Mapping[str, Any]) -> dict[str, str]:

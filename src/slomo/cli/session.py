@@ -97,14 +97,14 @@ class Session:
     def initialise(self) -> bool:
         """Write slomo.toml unless there is one; say so. True if it was written."""
         from slomo import settings
-        from slomo.pipeline import STAGES
+        from slomo.pipeline import ALL, STAGES
         from slomo.store import replace_file
         from slomo.template import template
 
         path = self.root / settings.FILE
         if path.is_file():
             return False
-        text = template({s.name: (s.module, s.config) for s in STAGES.values()})
+        text = template({s.name: (s.module, s.config) for s in STAGES.values() if s.shares != ALL})
         replace_file(path, text.encode())
         self.console.note(f"new project: {path}")
         return True

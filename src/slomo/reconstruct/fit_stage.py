@@ -1,4 +1,4 @@
-"""The fit as a stage: artifacts of decode, masks and camera in, metric key points and a report out."""
+"""The coarse fit as a stage: artifacts of decode, masks, camera and evidence in, the best hypothesis out."""
 
 import contextlib
 import time
@@ -15,17 +15,13 @@ from slomo.reconstruct import fit as fitting
 from slomo.reconstruct.evidence import Evidence, gather
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.observations import Observations, observe
-from slomo.reconstruct.outcome import Outcome, assess
 from slomo.reconstruct.problem import Problem, Schedule
+from slomo.reconstruct.run import as_arrays
 from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import Skeleton, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 4
-
-# The rest pose at the right place overlaps by 0.5 to 0.6, a fit that is right by 0.75 and more. Below this the body is
-# elsewhere or another shape in many frames, and its key points do not follow the subject.
-MIN_IOU = 0.45
+FIT_VERSION = 5
 
 
 @dataclass(frozen=True)
@@ -83,24 +79,44 @@ class FitConfig:
         return {k.removeprefix("weight_"): v for k, v in vars(self).items() if k.startswith("weight_")}
 
 
-def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
-    """Fit the skeleton to masks and flow.
+@dataclass(frozen=True)
+class Prepared:
+    """What `fit` and `reconstruct` both start from.
+
+    Attributes:
+        metres: wanted body length. camera_mode: as the camera stage named it.
+    """
+
+    skeleton: Skeleton
+    problem: Problem
+    metres: float
+    camera_mode: str
+    masks: Any
+    K: np.ndarray
+
+    @property
+    def evidence(self) -> list[str]:
+        """What networks and the user say anything of."""
+        return list(self.problem.said.groups) if self.problem.said else []
+
+
+def prepare(inputs: Inputs, config: FitConfig) -> Prepared:
+    """The problem of a clip.
 
     Reads the artifacts "decode" (frames.npz: t), "masks" (masks.npz, flow.npz), "camera" (camera.npz, report.json) and,
     where there is one, "evidence" (evidence.npz), and the file "skeleton" where the user gave one.
-
-    Returns:
-        keypoints.npz and report.json; `failure` is set when the body hardly overlaps the masks.
     """
-    began, cpu = time.perf_counter(), time.process_time()
     skeleton = load_skeleton(inputs.files.get("skeleton", config.skeleton))
     decode, masks, camera = (inputs.artifacts[k] for k in ("decode", "masks", "camera"))
     mode = camera.json["report.json"]["mode"]
-    t = np.asarray(decode.npz["frames.npz"]["t"], float)
     obs = observe(
-        t, masks.npz["masks.npz"], masks.npz["flow.npz"], camera.npz["camera.npz"],
-        fps=config.fps, subject_px=config.subject_px,
-    )  # fmt: skip
+        np.asarray(decode.npz["frames.npz"]["t"], float),
+        masks.npz["masks.npz"],
+        masks.npz["flow.npz"],
+        camera.npz["camera.npz"],
+        fps=config.fps,
+        subject_px=config.subject_px,
+    )
     kin = Kinematics(skeleton)
     path = Trajectory(obs.t, kin.B, joint_hz=config.joint_hz, root_hz=config.root_hz, width=config.width)
     spread = np.radians(config.tilt_moving_deg if mode == "moving" else config.tilt_static_deg)
@@ -110,24 +126,28 @@ def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
         weights["facing"] = 0.0
     terms = {**losses.TERMS, **(evidence_terms.terms(said) if said else {})}
     problem = Problem(obs, kin, path, weights, float(spread), terms, said)
-    root = hypotheses.root_guess(obs, skeleton)
     metres = config.length_m or skeleton.typical_length
-    with _one_thread():
-        run = fitting.fit(problem, root, _effort(config), metres=metres, seed=config.seed, progress=progress)
-        outcome = assess(problem, run, metres)
-    source = "length_m" if config.length_m else f"typical length of {skeleton.name}"
-    progress.note(f"size: {metres:g} m from {source}; the video alone does not tell it")
-    report: dict[str, Any] = outcome.report | {
-        "skeleton": skeleton.name, "camera_mode": mode, "length_m": metres, "scale_source": source,
-        "evidence": list(said.groups) if said else [],
+    return Prepared(skeleton, problem, metres, mode, masks.npz["masks.npz"], camera.npz["camera.npz"]["K"])
+
+
+def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
+    """Fit the skeleton to masks and flow; reads what `prepare` does.
+
+    Returns:
+        fit.npz, the winner's variables (`run.from_arrays` reads them), and report.json with every hypothesis.
+    """
+    began, cpu = time.perf_counter(), time.process_time()
+    made = prepare(inputs, config)
+    root = hypotheses.root_guess(made.problem.obs, made.skeleton)
+    with one_thread():
+        effort = _effort(config)
+        run = fitting.fit(made.problem, root, effort, metres=made.metres, seed=config.seed, progress=progress)
+    report: dict[str, Any] = {
+        "hypothesis": run.labels[0], "loss": run.log["final"][0]["loss"], "search": run.log,
+        "skeleton": made.skeleton.name, "camera_mode": made.camera_mode, "evidence": made.evidence,
         "seconds": round(time.perf_counter() - began, 1), "cpu_seconds": round(time.process_time() - cpu, 1),
     }  # fmt: skip
-    arrays = _arrays(obs, skeleton, outcome, masks.npz["masks.npz"], camera.npz["camera.npz"]["K"])
-    iou = report["silhouette_iou"]
-    failure = None
-    if iou < MIN_IOU:
-        failure = f"the fitted body covers the subject badly (IoU {iou:.2f}, needs {MIN_IOU}); look at the masks"
-    return Artifact(npz={"keypoints.npz": arrays}, json={"report.json": report}, failure=failure)
+    return Artifact(npz={"fit.npz": as_arrays(run)}, json={"report.json": report})
 
 
 def _evidence(inputs: Inputs, obs: Observations, skeleton: Skeleton, weights: dict[str, float]) -> Evidence | None:
@@ -140,7 +160,7 @@ def _evidence(inputs: Inputs, obs: Observations, skeleton: Skeleton, weights: di
 
 
 @contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """One torch thread: sums then round alike on every machine, and tensors of this size gain little from two (on a
     busy machine threads that wait for each other make it many times slower)."""
     before = torch.get_num_threads()
@@ -163,12 +183,3 @@ def _effort(config: FitConfig) -> fitting.Effort:
         candidates=config.candidates,
         phases_of_gait=config.gait_phases,
     )
-
-
-def _arrays(obs: Observations, skeleton: Skeleton, o: Outcome, masks: Any, K: np.ndarray) -> dict[str, np.ndarray]:
-    return dict(
-        t=obs.t.numpy().astype(float), keypoints=o.keypoints, keypoint_names=np.array(o.names),
-        confidence=o.confidence, contact=o.contact,
-        contact_names=np.array([skeleton.names[c] for c in skeleton.contacts]),
-        K=np.asarray(K, float), T_world_cam=o.T_world_cam, packed=masks["packed"], shape=masks["shape"],
-    )  # fmt: skip

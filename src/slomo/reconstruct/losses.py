@@ -4,7 +4,7 @@ A term maps a `State` (the posed body, its projection, the draw of pixels) to on
 and of order one when the pose is off by a limb's width. A learned prior, a neural field, physics: each is another term.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -32,6 +32,7 @@ class State:
             `pixel`; the first `inside` of P lie in the mask. out: outline of the capsules there; sd, h: (H, S, P, C).
         ends: camera-frame capsule ends (H, F, C, 3) a and b.
         stance: (H, F-1, L) hypothetical contact times its present weight; negative where there is none.
+        x: all variables by name, for terms that have some of their own.
     """
 
     obs: Observations
@@ -53,6 +54,7 @@ class State:
     h: Tensor
     ends: tuple[Tensor, Tensor]
     stance: Tensor
+    x: Mapping[str, Tensor]
 
 
 Term = Callable[[State], Tensor]

@@ -90,7 +90,7 @@ class Problem:
         return losses.State(
             obs=obs, kin=kin, body=body, q=q, R_root=R_root, shape=shape, tilt=x["tilt"], R_cam=R_cam, centre=centre,
             seen=draw.seen, u=u, v=v, pixel=draw.pixel, inside=draw.inside, out=out, sd=sd, h=h, ends=(a, b),
-            stance=stance,
+            stance=stance, x=x,
         )  # fmt: skip
 
     def loss(self, x: Variables, guess: Guess, draw: Draw, *, stance_weight: float = 0.0) -> tuple[Tensor, Variables]:

@@ -30,6 +30,23 @@ class Run:
     log: dict = field(default_factory=dict)
 
 
+def as_arrays(run: Run) -> dict[str, np.ndarray]:
+    """Everything of a run, as an artifact or a checkpoint holds it."""
+    out = {f"x.{k}": v.detach().numpy().copy() for k, v in run.x.items()}
+    out |= {f"guess.{f.name}": getattr(run.guess, f.name).numpy() for f in fields(Guess)}
+    meta = dict(phase=run.phase, labels=run.labels, log=run.log)
+    return out | {"meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)}
+
+
+def from_arrays(arrays: Arrays) -> Run:
+    """The inverse of `as_arrays`."""
+    tensor = lambda a: torch.from_numpy(np.array(a))  # noqa: E731
+    meta = json.loads(bytes(np.asarray(arrays["meta"])))
+    x = {k[2:]: tensor(v) for k, v in arrays.items() if k.startswith("x.")}
+    guess = Guess(**{f.name: tensor(arrays[f"guess.{f.name}"]) for f in fields(Guess)})
+    return Run(meta["phase"], x, guess, meta["labels"], meta["log"])
+
+
 def join(guesses: Sequence[Guess]) -> Guess:
     """The hypotheses of several guesses as one."""
     return Guess(**{f.name: torch.cat([getattr(g, f.name) for g in guesses]) for f in fields(Guess)})
@@ -39,12 +56,10 @@ def checkpoint(
     run: Run, iteration: int, optimiser: torch.optim.Adam, generator: torch.Generator
 ) -> dict[str, np.ndarray]:
     """Everything that `restore` needs to go on to the same bits."""
-    out = {f"x.{k}": v.detach().numpy().copy() for k, v in run.x.items()}
-    out |= {f"guess.{f.name}": getattr(run.guess, f.name).numpy() for f in fields(Guess)}
+    out = as_arrays(run)
     for n, s in optimiser.state_dict()["state"].items():
         out |= {f"adam.{n}.{k}": v.numpy().copy() for k, v in s.items()}
-    meta = dict(phase=run.phase, iteration=iteration, labels=run.labels, log=run.log)
-    out["meta"] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
+    out["iteration"] = np.array(iteration)
     out["rng"] = generator.get_state().numpy()
     return out
 
@@ -53,15 +68,10 @@ def restore(saved: Arrays | None, generator: torch.Generator) -> tuple[Run | Non
     """Run, iteration and Adam's moments from a checkpoint; the generator is set to where it was."""
     if saved is None:
         return None, 0, None
-    z = {k: np.array(v) for k, v in saved.items()}
-    tensor = lambda a: torch.from_numpy(a.copy())  # noqa: E731
-    meta = json.loads(bytes(z["meta"]))
-    x = {k[2:]: tensor(v) for k, v in z.items() if k.startswith("x.")}
-    guess = Guess(**{f.name: tensor(z[f"guess.{f.name}"]) for f in fields(Guess)})
-    generator.set_state(tensor(z["rng"]))
+    generator.set_state(torch.from_numpy(np.array(saved["rng"])))
     state: dict[int, dict] = {}
-    for k, v in z.items():
+    for k, v in saved.items():
         if k.startswith("adam."):
             _, n, name = k.split(".")
-            state.setdefault(int(n), {})[name] = tensor(v)
-    return Run(meta["phase"], x, guess, meta["labels"], meta["log"]), meta["iteration"], state
+            state.setdefault(int(n), {})[name] = torch.from_numpy(np.array(v))
+    return from_arrays(saved), int(saved["iteration"]), state
