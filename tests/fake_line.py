@@ -43,6 +43,7 @@ class FitConfig:
     iterations: int = 20
     seed: int = 0
     fps: float = 15.0
+    quality: str = "normal"
 
     def __post_init__(self):
         if self.iterations < 1:
@@ -51,7 +52,7 @@ class FitConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ReconstructConfig(FitConfig):
-    quality: str = "normal"
+    """Those of the fit."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -82,6 +82,7 @@ def test_every_option_of_reconstruct_is_a_parameter():
         ("evidence", "prior"),
         ("reconstruct", "length_m"),
         ("reconstruct", "skeleton"),
+        ("reconstruct", "quality"),
     ]:
         assert hasattr(parameters[stage](), name), (stage, name)
 

@@ -18,6 +18,9 @@ MasksOption = Annotated[Path | None, typer.Option("--masks", metavar="DIR", help
 WeightsOption = Annotated[Path | None, typer.Option("--weights", help="U2-Net-p weights (.onnx).")]
 StartOption = Annotated[float | None, typer.Option("--start", help="First second of the clip to use.")]
 DurationOption = Annotated[float | None, typer.Option("--duration", help="Seconds to use; 0: all.")]
+QualityOption = Annotated[
+    str | None, typer.Option("--quality", metavar="draft|normal|high", help="How long to work on the reconstruction.")
+]
 LengthOption = Annotated[
     float | None, typer.Option("--length", help="Body length in metres (the clip alone cannot tell it).")
 ]
@@ -90,6 +93,7 @@ def _from_clip(
     start: float | None,
     duration: float | None,
     length: float | None,
+    quality: str | None,
     fov: float | None,
     evidence: dict[str, dict[str, Any]],
 ) -> dict[str, dict[str, Any]]:
@@ -104,7 +108,7 @@ def _from_clip(
     if masks is not None and segmenter is None:
         changes["masks"] = {"segmenter": None}  # the default takes the masks that are given
     changes["camera"] = _given(fov_deg=fov)
-    changes["reconstruct"] = changes.get("reconstruct", {}) | _given(length_m=length)
+    changes["reconstruct"] = changes.get("reconstruct", {}) | _given(length_m=length, quality=quality)
     return changes
 
 
@@ -126,24 +130,27 @@ def add_commands(app: typer.Typer) -> None:
         start: StartOption = None,
         duration: DurationOption = None,
         length: LengthOption = None,
+        quality: QualityOption = None,
         fov: FovOption = None,
         prior: PriorOption = None,
         keypoints2d: Keypoints2dOption = None,
         keypoint_model: ModelOption = None,
         keypoint_map: MapOption = None,
     ) -> None:
-        """Key points in metres from a clip: decode, masks, camera, evidence, skeleton fit.
+        """Key points in metres from a clip: decode, masks, camera, evidence, fit, refinement.
 
         Options given here are written into slomo.toml, and hold until they are changed there or given anew.
 
         \b
         slomo reconstruct cat.mp4
-        slomo reconstruct cat.mp4 --duration 4 --length 0.45
+        slomo reconstruct cat.mp4 --duration 4 --length 0.45 --quality draft
         slomo reconstruct man.mp4 --skeleton human
         slomo reconstruct cat.mp4 --prior none --keypoints2d points.json
         """
         evidence = _evidence(session, prior, keypoints2d, keypoint_model, keypoint_map)
-        changes = _from_clip(session, skeleton, segmenter, masks, weights, start, duration, length, fov, evidence)
+        changes = _from_clip(
+            session, skeleton, segmenter, masks, weights, start, duration, length, quality, fov, evidence
+        )
         if clip is not None:
             changes["inputs"] |= {"clip": session.user_path(clip, "clip")} | session.choice_reopened("clip")
         project = session.configure(changes)
@@ -242,6 +249,7 @@ def add_commands(app: typer.Typer) -> None:
         start: StartOption = None,
         duration: DurationOption = None,
         length: LengthOption = None,
+        quality: QualityOption = None,
         fov: FovOption = None,
         prior: PriorOption = None,
         keypoints2d: Keypoints2dOption = None,
@@ -256,7 +264,9 @@ def add_commands(app: typer.Typer) -> None:
         slomo run cat00.json --robot go1
         """
         evidence = _evidence(session, prior, keypoints2d, keypoint_model, keypoint_map)
-        changes = _from_clip(session, skeleton, segmenter, masks, weights, start, duration, length, fov, evidence)
+        changes = _from_clip(
+            session, skeleton, segmenter, masks, weights, start, duration, length, quality, fov, evidence
+        )
         inputs = changes["inputs"]
         inputs |= _truth(session, truth)
         if source is not None:

@@ -23,6 +23,9 @@ from slomo.stage import Artifact, Inputs, Progress
 
 FIT_VERSION = 5
 
+# Of the heading, gait, rivals and final phase.
+ITERATIONS = {"draft": (60, 60, 80, 250), "normal": (100, 120, 150, 700), "high": (150, 200, 300, 1400)}
+
 
 @dataclass(frozen=True)
 class FitConfig:
@@ -34,7 +37,8 @@ class FitConfig:
         seed: of every random choice.
         fps: fit frames a second at most. subject_px: size of the subject in working pixels (root of its area).
         width: neurons of the hidden layers of Q and G. joint_hz, root_hz: highest frequency of their time features.
-        iterations: of the heading, gait, rivals and final phase.
+        quality: draft, normal or high: how long it works on it.
+        iterations: of the heading, gait, rivals and final phase; none: as the quality says.
         candidates: hypotheses that are fitted in the gait phase; gait_phases: phases tried of each gait.
         tilt_moving_deg, tilt_static_deg: s.d. of the given gravity for a camera that moved, and for one that did not.
         weight_*: of the evidence; 0 switches a term off. `facing` is for people only; `view`, `keypoints`, `parts` and
@@ -49,7 +53,8 @@ class FitConfig:
     width: int = 64
     joint_hz: float = 4.0
     root_hz: float = 2.5
-    iterations: tuple[int, ...] = (100, 120, 150, 700)
+    quality: str = "normal"
+    iterations: tuple[int, ...] = ()
     candidates: int = 8
     gait_phases: int = 12
     tilt_moving_deg: float = 0.7
@@ -72,7 +77,9 @@ class FitConfig:
     def __post_init__(self):
         if self.length_m < 0:
             raise UsageError("must be 0 (typical) or a length in m", where="length_m", valid=["0", "0.2 ... 3"])
-        if len(self.iterations) != len(fitting.PHASES):
+        if self.quality not in ITERATIONS:
+            raise UsageError(f"quality is {self.quality!r}", where="quality", valid=ITERATIONS)
+        if self.iterations and len(self.iterations) != len(fitting.PHASES):
             raise UsageError("needs one number for each phase", where="iterations", valid=fitting.PHASES)
 
     def weights(self) -> dict[str, float]:
@@ -172,7 +179,7 @@ def one_thread() -> Iterator[None]:
 
 
 def _effort(config: FitConfig) -> fitting.Effort:
-    heading, gait, rivals, final = config.iterations
+    heading, gait, rivals, final = config.iterations or ITERATIONS[config.quality]
     return fitting.Effort(
         schedules=(
             Schedule(heading, 12, 160, ("G", "shape.log_length", "shape.group", "shape.girth")),

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from slomo.errors import UsageError
 from slomo.reconstruct.fit_stage import FitConfig, Prepared, one_thread, prepare
 from slomo.reconstruct.outcome import Outcome, assess
 from slomo.reconstruct.run import from_arrays
@@ -14,7 +13,6 @@ from slomo.stage import Artifact, Inputs, Progress
 
 REFINE_VERSION = 1
 
-QUALITIES = ("draft", "normal", "high")
 # The rest pose at the right place overlaps by 0.5 to 0.6, a fit that is right by 0.75 and more. Below this the body is
 # elsewhere or another shape in many frames, and its key points do not follow the subject.
 MIN_IOU = 0.45
@@ -23,17 +21,7 @@ MIN_IOU = 0.45
 @dataclass(frozen=True)
 class ReconstructConfig(FitConfig):
     """Parameters of the reconstruction: those of the fit, and of its refinement.
-
-    Attributes:
-        quality: "draft" (the coarse fit alone), "normal" or "high".
     """
-
-    quality: str = "normal"
-
-    def __post_init__(self):
-        super().__post_init__()
-        if self.quality not in QUALITIES:
-            raise UsageError(f"quality is {self.quality!r}", where="quality", valid=QUALITIES)
 
 
 def run_refine(inputs: Inputs, config: ReconstructConfig, progress: Progress) -> Artifact:
