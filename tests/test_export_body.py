@@ -1,6 +1,7 @@
 """The skin of a skeleton: it is where the capsules are, moves with them, and has the colours that the clip shows."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import trimesh
 from slomo.mesh import SkinnedMesh
 from slomo.raycast import Light, Part, Scene, intrinsics, look_at
 from slomo.reconstruct.body_colours import coloured_by_clip
-from slomo.reconstruct.body_mesh import LEFT, RIGHT, apart, body_mesh
+from slomo.reconstruct.body_mesh import LEFT, RIGHT, apart, body_mesh, field_mesh
 from slomo.reconstruct.kinematics import Kinematics, Posed
 from slomo.skeleton import list_skeletons, load_skeleton
 
@@ -72,6 +73,23 @@ def test_links_are_where_the_kinematics_has_them(parts):
     np.testing.assert_allclose(mesh.T_world_link[..., :3, 3], METRES * body.nodes[0, :, : kin.B].numpy(), atol=1e-6)
     assert mesh.link_names == kin.skeleton.names[: kin.B]
     assert mesh.rest[0].tolist() == np.eye(4).tolist()
+
+
+def test_the_surface_of_a_field_moves_with_the_links(parts):
+    """Points on the links, each carried by its own, are seen in metres where the kinematics puts them."""
+    kin, body, _ = parts
+    shape = kin.shape_variables(2)
+    straight = kin.pose(shape, torch.zeros(1, 1, 3), torch.eye(3).expand(1, 1, 3, 3), torch.zeros(1, 1, kin.B, 3))
+    origins = straight.nodes[0, 0, : kin.B].numpy().astype(float)
+    out = np.array([0.1, 0.02, -0.05])
+    surface = SimpleNamespace(
+        vertices=origins + out, faces=np.array([[0, 1, 2]]), colours=np.full((kin.B, 3), 1.0001), weights=np.eye(kin.B)
+    )
+    mesh = field_mesh(surface, kin, shape, body, np.arange(T) / 30, metres_per_unit=METRES)  # pyright: ignore
+    for k in range(T):
+        want = body.nodes[0, k, : kin.B].numpy() + body.R[0, k].numpy() @ out
+        np.testing.assert_allclose(mesh.posed(k), METRES * want, atol=1e-5)
+    assert mesh.colours.max() == 1
 
 
 def test_left_is_orange_and_right_is_blue(parts):
