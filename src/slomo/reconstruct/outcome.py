@@ -39,7 +39,7 @@ def assess(problem: Problem, run: Run, metres: float) -> Outcome:
         position, R, q = problem.path(run.x, run.guess, shape["log_length"].exp(), every)
         body = kin.pose(shape, position, R, q)
         R_cam, centre = problem.cameras(run.x["tilt"], every)
-        own = _own_length(problem, shape)
+        own = own_length(problem, shape)
         per_unit = metres / own
         nodes = body.nodes[0].numpy().astype(float)
         contact = _contact(nodes[:, list(skeleton.contacts)], obs.t.numpy(), own, skeleton.sole)
@@ -99,7 +99,7 @@ def _named(entry: dict) -> dict:
     return {k: v for k, v in entry.items() if k != "loss"}
 
 
-def _own_length(problem: Problem, shape: dict[str, torch.Tensor]) -> float:
+def own_length(problem: Problem, shape: dict[str, torch.Tensor]) -> float:
     """Body length of the fitted shape at rest, world units: withers to tail base, or standing height."""
     skeleton = problem.kin.skeleton
     offset = problem.kin.offsets(shape)[0].numpy()

@@ -110,6 +110,7 @@ class Schedule:
     Attributes:
         iterations; frames and pixels of each draw; learn: prefixes of the variables that change.
         stance: weight of the hypothetical contacts at the start; it falls to 0 at two thirds.
+        rate: factor of every variable's rate.
     """
 
     iterations: int
@@ -117,6 +118,7 @@ class Schedule:
     pixels: int
     learn: tuple[str, ...]
     stance: float = 0.0
+    rate: float = 1.0
 
 
 def rate(name: str) -> float:
@@ -150,7 +152,7 @@ def optimise(
         decay = 0.1 + 0.45 * (1 + np.cos(np.pi * i / n))
         warm = min(1.0, (i + 1) / 10)
         for group in optimiser.param_groups:
-            group["lr"] = group["rate"] * decay * warm
+            group["lr"] = group["rate"] * schedule.rate * decay * warm
         draw = problem.draw(schedule.frames, schedule.pixels, generator)
         fade = schedule.stance * max(0.0, 1 - 1.5 * i / n)
         loss, _ = problem.loss(x, guess, draw, stance_weight=fade)

@@ -1,0 +1,214 @@
+"""What is learned of the physics: controls and parameters with which the simulated body follows the kinematic one."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from slomo.reconstruct.physics.model import GRAVITY, Body
+from slomo.reconstruct.physics.rollout import Controls, RollOut, Watched
+from slomo.reconstruct.physics.windows import Guides, Kinematic, Windows, cover, guides
+
+Array = np.ndarray
+Tensor = torch.Tensor
+Variables = dict[str, Tensor]
+
+FOOT_WEIGHT = 3.0  # of a foot's place against another node's
+CLIP = 3.0  # largest gradient of a window, in units of the variables' spread
+
+
+@dataclass(frozen=True)
+class PhysicsConfig:
+    """How the physics is simulated and learned.
+
+    Attributes:
+        window, overlap: s. dt: s of a step at most. knot: s between the knots of the controllers' corrections.
+        iterations: of Adam in a round. rate: of Adam, in units of the variables' spread.
+        assistance: share of the pull on the root at the first iteration, and the one at the end. It falls
+            geometrically over the first two thirds of the iterations of a first round.
+    """
+
+    window: float = 1.2
+    overlap: float = 0.3
+    dt: float = 0.0025
+    knot: float = 0.1
+    iterations: int = 60
+    rate: float = 0.1
+    assistance: tuple[float, float] = (0.3, 0.003)
+
+
+# What one unit of a variable changes: rad, and in body lengths and sqrt(length / g) what has a dimension.
+SPREAD = {
+    "knots": 0.15, "position": 0.02, "turn": 0.05, "velocity": 0.1, "spin": 0.3, "log_ke": 0.5, "log_kd": 0.5,
+    "log_mass": 0.2, "log_size": 0.15,
+}  # fmt: skip
+SHARED = ("log_ke", "log_kd", "log_mass", "log_size")
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A simulated trajectory at the kinematic's T moments. Metres, newtons.
+
+    Attributes:
+        nodes: (T, M, 3) m. force: (T, F, 3) N of the ground on each foot, mean over the time from moment to moment.
+        trust: (T,) in [0, 1], 0 where the simulation did not follow (it fell, or is not finite).
+        report: figures for the eye.
+    """
+
+    nodes: Array
+    force: Array
+    trust: Array
+    report: dict[str, Any] = field(default_factory=dict)
+
+
+class Learner:
+    """Follows one kinematic trajectory with one body; `variables` are plain tensors and go from round to round."""
+
+    def __init__(self, body: Body, kinematic: Kinematic, mirror: Array, config: PhysicsConfig, device: str = "cpu"):
+        """mirror: (B,) link on the other side."""
+        self.body, self.kinematic, self.config = body, kinematic, config
+        c = config
+        self.windows: Windows = cover(kinematic.t, length=c.window, overlap=c.overlap, dt=c.dt, knot=c.knot)
+        self.guides: Guides = guides(kinematic, self.windows)
+        self.roll = RollOut(body, self.windows.step, steps=self.windows.steps, dt=self.windows.dt, device=device)
+        self.mirror = torch.as_tensor(mirror)
+        here = torch.as_tensor(self.windows.frame >= 0, dtype=torch.float32)
+        heavy = torch.ones(len(body.link))
+        heavy[body.contact_node[body.contact_node >= 0]] = FOOT_WEIGHT
+        self.share = (here / here.sum(1, keepdim=True))[..., None] * heavy / heavy.sum()
+
+    def start(self) -> Variables:
+        """Zeros: the kinematic trajectory itself, and the body as built."""
+        N, K, B = self.windows.count, self.windows.basis.shape[1], len(self.body.parent)
+        sizes = dict(
+            knots=(N, K, B, 3), position=(N, 3), turn=(N, 3), velocity=(N, 3), spin=(N, 3), log_ke=(), log_kd=(),
+            log_mass=(B,), log_size=(),
+        )  # fmt: skip
+        return {k: torch.zeros(s) for k, s in sizes.items()}
+
+    def controls(self, x: Mapping[str, Tensor], assistance: float) -> Controls:
+        """What the variables say, in SI units."""
+        body, g, m, N = self.body, self.guides, self.body.mechanics, self.windows.count
+        L, pace = body.length, float(np.sqrt(body.length / GRAVITY))
+        s = {k: SPREAD[k] * v for k, v in x.items()}
+        bend = torch.einsum("sk,nkbi->nsbi", self.windows.basis, s["knots"])
+        turn = _quaternion(s["turn"])
+        mass = (s["log_mass"] + s["log_mass"][self.mirror]).mul(0.5).exp()
+        wide = lambda v: v.expand(N)  # noqa: E731
+        return Controls(
+            target=g.q + bend,
+            position=g.position[:, 0] + L * s["position"],
+            quaternion=_product(turn, g.quaternion[:, 0]),
+            velocity=g.velocity + L / pace * s["velocity"],
+            spin=g.spin + s["spin"] / pace,
+            mass_scale=mass.expand(N, -1),
+            ke=wide(m.ke * body.weight / L * s["log_ke"].exp()),
+            kd=wide(m.kd / (L / pace) * s["log_kd"].exp()),
+            # A larger body is the same body at a slower time: less gravity at the given size.
+            gravity=wide(GRAVITY * (-s["log_size"]).exp()),
+            assistance=torch.full((N,), assistance),
+            guide_position=g.position,
+            guide_quaternion=g.quaternion,
+        )  # fmt: skip
+
+    def distance(self, nodes: Tensor) -> Tensor:
+        """(N,) of each window: mean distance to the kinematic nodes, robust, in 5 % of the body length."""
+        e = (nodes - self.guides.nodes).square().sum(-1) / (0.05 * self.body.length) ** 2
+        return ((2 * (1 + e / 2).sqrt() - 2) * self.share).sum((1, 2))
+
+    def effort(self, x: Mapping[str, Tensor]) -> Tensor:
+        """(N,) of each window: corrections that are large, or change fast, and parameters away from the known."""
+        k = x["knots"]
+        own = 0.02 * k.square().sum(-1).mean((1, 2))
+        if k.shape[1] > 2:
+            own = own + 0.02 * (k[:, 2:] - 2 * k[:, 1:-1] + k[:, :-2]).square().sum(-1).mean((1, 2))
+        own = own + 0.01 * sum(x[n].square().sum(-1) for n in ("position", "turn", "velocity", "spin"))
+        return own + 0.01 * sum(x[n].square().mean() for n in SHARED)
+
+    def learn(self, x: Variables, iterations: int, assistance: Array) -> tuple[Variables, list[float]]:
+        """`iterations` of Adam from x, with the assistance of each; the result and the loss of each."""
+        x = {k: v.detach().clone().requires_grad_() for k, v in x.items()}
+        optimiser = torch.optim.Adam(x.values(), lr=self.config.rate, betas=(0.9, 0.95))
+        losses = []
+        for i in range(iterations):
+            decay = 0.15 + 0.85 * 0.5 * (1 + np.cos(np.pi * i / iterations))
+            for group in optimiser.param_groups:
+                group["lr"] = self.config.rate * decay
+            loss = self.distance(self.roll(self.controls(x, float(assistance[i])))) + self.effort(x)
+            optimiser.zero_grad()
+            # A window whose simulation broke must not spoil what all share.
+            torch.where(torch.isfinite(loss), loss, 0.0).sum().backward()
+            _tame(x)
+            optimiser.step()
+            losses.append(float(loss.detach().nan_to_num(100.0).mean()))
+        return {k: v.detach() for k, v in x.items()}, losses
+
+    def simulate(self, x: Variables, assistance: float) -> Simulated:
+        """The roll-out as it is, its windows blended."""
+        with torch.no_grad():
+            nodes = self.roll(self.controls(x, assistance))
+            e = (nodes - self.guides.nodes).norm(dim=-1) / self.body.length
+        return self._blended(nodes.numpy().astype(float), e.numpy(), self.roll.watched(), assistance)
+
+    def _blended(self, nodes: Array, error: Array, seen: Watched, assistance: float) -> Simulated:
+        w, body, T = self.windows, self.body, len(self.kinematic.t)
+        here = w.frame >= 0
+        mean = np.array([np.nanmean(np.where(np.isfinite(e[h]), e[h], 9.0)) for e, h in zip(error, here, strict=True)])
+        good = mean < LOST
+        feet = np.flatnonzero(body.contact_node >= 0)
+        feet = feet[np.argsort(body.contact_node[feet])]
+        force = np.nan_to_num(seen.force[:, :, feet])
+        total = np.concatenate([np.zeros_like(force[:, :1]), force.cumsum(1)], 1)
+        half = 0.5 * np.median(np.diff(self.kinematic.t)) / w.dt
+        low, high = (np.clip(np.rint(w.step + s * half), 0, w.steps).astype(int) for s in (-1, 1))
+        rows = np.arange(w.count)[:, None]
+        force = (total[rows, high] - total[rows, low]) / np.maximum(high - low, 1)[..., None, None]
+        safe = np.where(good[:, None, None, None], np.nan_to_num(nodes), self.guides.nodes.numpy())
+        wrench = np.linalg.norm(seen.wrench[:, :, 0], axis=-1)
+        report = {
+            "windows": w.count,
+            "lost_windows": int((~good).sum()),
+            "error_pct": [round(100 * float(m), 2) for m in mean],
+            "assistance": assistance,
+            "assisting_force_of_weight": round(float(np.nanmean(wrench[good])) / body.weight, 4)
+            if good.any()
+            else None,
+        }
+        trust = w.merge(np.broadcast_to(good[:, None].astype(float), w.frame.shape), T)
+        return Simulated(w.merge(safe, T), w.merge(force, T), trust, report)
+
+
+LOST = 0.15  # body lengths: a window whose nodes are that far from the kinematic ones on average did not follow
+
+
+def _tame(x: Variables) -> None:
+    """Clip the gradient of each window to `CLIP`, and of what all share."""
+    own = [v for k, v in x.items() if k not in SHARED]
+    norm = sum(_gradient(v).square().flatten(1).sum(1) for v in own).sqrt()  # pyright: ignore[reportAttributeAccessIssue]
+    for v in own:
+        g = _gradient(v)
+        bad = ~torch.isfinite(norm)
+        g.mul_((CLIP / norm.clamp(min=CLIP)).reshape(-1, *[1] * (g.dim() - 1)))
+        g[bad] = 0
+    for k in SHARED:
+        g = _gradient(x[k])
+        g.nan_to_num_(0.0, 0.0, 0.0).clamp_(-CLIP, CLIP)
+
+
+def _gradient(v: Tensor) -> Tensor:
+    assert v.grad is not None
+    return v.grad
+
+
+def _quaternion(rotation: Tensor) -> Tensor:
+    """(..., 4) xyzw of small rotation vectors (..., 3)."""
+    return torch.nn.functional.normalize(torch.cat([rotation / 2, torch.ones_like(rotation[..., :1])], -1), dim=-1)
+
+
+def _product(a: Tensor, b: Tensor) -> Tensor:
+    """(..., 4) a b of quaternions xyzw."""
+    av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
+    v = aw * bv + bw * av + torch.linalg.cross(av, bv)
+    return torch.cat([v, aw * bw - (av * bv).sum(-1, keepdim=True)], -1)
