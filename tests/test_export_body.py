@@ -79,7 +79,9 @@ def test_the_surface_of_a_field_moves_with_the_links(parts):
     """Points on the links, each carried by its own, are seen in metres where the kinematics puts them."""
     kin, body, _ = parts
     shape = kin.shape_variables(2)
-    straight = kin.pose(shape, torch.zeros(1, 1, 3), torch.eye(3).expand(1, 1, 3, 3), torch.zeros(1, 1, kin.B, 3))
+    straight = kin.pose(
+        kin.shape_variables(1), torch.zeros(1, 1, 3), torch.eye(3).expand(1, 1, 3, 3), torch.zeros(1, 1, kin.B, 3)
+    )
     origins = straight.nodes[0, 0, : kin.B].numpy().astype(float)
     out = np.array([0.1, 0.02, -0.05])
     surface = SimpleNamespace(
