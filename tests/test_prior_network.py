@@ -13,7 +13,7 @@ import torch
 from slomo.errors import InvalidData, MissingInput, UsageError
 from slomo.prior import augment, dataset, metrics, objective
 from slomo.prior.export import onnx_bytes
-from slomo.prior.inference import OUTPUTS, Prior
+from slomo.prior.inference import OUTPUTS, Prior, mirrored_crops, packaged
 from slomo.prior.labels import BINS, labels, rotation_of, view_of
 from slomo.prior.network import Network, NetworkConfig, Output, network
 from slomo.prior.train import train
@@ -126,6 +126,21 @@ def test_export_says_the_same_as_torch_and_stores_halves(tmp_path):
             mine = mine.numpy()
             assert its.shape == mine.shape
             assert np.abs(its - mine).max() < 0.02 * max(np.abs(mine).max(), 1), name
+
+
+@pytest.mark.parametrize("kind", ["quadruped", "human"])
+def test_a_mirrored_crop_gets_the_mirrored_answer(kind):
+    crops = np.random.default_rng(0).normal(size=(2, 6, 64, 64)).astype(np.float32)
+    path, known = packaged(kind), labels(load_skeleton(kind))
+    assert path is not None
+    prior = Prior(path)
+    one, other = prior(crops), prior(mirrored_crops(crops))
+    np.testing.assert_allclose(other.parts, one.parts[:, known.mirror_part, :, ::-1], atol=1e-5)
+    np.testing.assert_allclose(other.heat, one.heat[:, known.mirror_keypoint, :, ::-1], atol=1e-5)
+    np.testing.assert_allclose(other.seen, one.seen[:, known.mirror_keypoint], atol=1e-5)
+    np.testing.assert_allclose(other.view[:, 5], one.view[:, -5], atol=1e-5)
+    np.testing.assert_allclose(other.surface[:, 1], -one.surface[:, 1, :, ::-1], atol=1e-4)
+    np.testing.assert_allclose(other.up, one.up * [-1, 1, 1], atol=1e-4)
 
 
 # ---- augmentation

@@ -30,14 +30,22 @@ class Notes(Silent):
         self.said.append(message)
 
 
-def constant_network(path, outputs, *, shape, metadata=None):
-    """An ONNX file that gives the same `outputs` (name -> array without the batch's axis) for each picture."""
+def constant_network(path, outputs, *, shape, metadata=None, to_the_left=None):
+    """An ONNX file that gives the same `outputs` (name -> array without the batch's axis) for each picture; or
+    `to_the_left` where the subject moves to the left (channel 4 is negative)."""
     rank = len(shape)
     nodes = [
         helper.make_node("ReduceMean", ["input"], ["mean"], axes=list(range(1, rank)), keepdims=1),
         helper.make_node("Mul", ["mean", "zero"], ["nothing"]),
     ]
     fixed = [numpy_helper.from_array(np.zeros(1, np.float32), "zero")]
+    if to_the_left is not None:
+        fixed.append(numpy_helper.from_array(np.array([4], np.int64), "channel"))
+        nodes += [
+            helper.make_node("Gather", ["input", "channel"], ["motion"], axis=1),
+            helper.make_node("ReduceMean", ["motion"], ["speed"], axes=[1, 2, 3], keepdims=1),
+            helper.make_node("Less", ["speed", "zero"], ["left"]),
+        ]
     for name, value in outputs.items():
         value = np.asarray(value, np.float32)[None]
         fixed += [
@@ -46,8 +54,15 @@ def constant_network(path, outputs, *, shape, metadata=None):
         ]
         nodes += [
             helper.make_node("Reshape", ["nothing", f"{name}_shape"], [f"{name}_nothing"]),
-            helper.make_node("Add", [f"{name}_nothing", f"{name}_value"], [name]),
+            helper.make_node("Add", [f"{name}_nothing", f"{name}_value"], [f"{name}_right" if to_the_left else name]),
         ]
+        if to_the_left is not None:
+            other = np.asarray(to_the_left[name], np.float32)[None]
+            fixed.append(numpy_helper.from_array(other, f"{name}_other"))
+            nodes += [
+                helper.make_node("Reshape", ["left", f"{name}_shape"], [f"{name}_left"]),
+                helper.make_node("Where", [f"{name}_left", f"{name}_other", f"{name}_right"], [name]),
+            ]
     graph = helper.make_graph(
         nodes, "constant",
         [helper.make_tensor_value_info("input", TensorProto.FLOAT, shape)],
@@ -76,7 +91,8 @@ def about(**changes):
 
 
 def our_network(path, *, metadata=None):
-    """Sees the trunk in the middle, the subject from its left, and every key point at its cell."""
+    """Sees the trunk in the middle, the subject from its left, and every key point at its cell; all of it mirrored when
+    the subject moves to the left of the picture."""
     P, K = len(QUADRUPED.parts), len(QUADRUPED.keypoints)
     parts = np.zeros((P + 1, 64, 64))
     parts[0] = 6.0
@@ -85,15 +101,19 @@ def our_network(path, *, metadata=None):
     surface[3] = np.log(0.1)
     view = np.zeros(36)
     view[9] = 8.0
+    heat, seen, up = heatmap(CELLS, 32), np.full(K, 3.0), np.array([0.0, -3.0, 0.0])
+    mirrored = {
+        "parts": parts[QUADRUPED.mirror_part][..., ::-1],
+        "surface": surface[..., ::-1] * np.array([1, -1, 1, 1])[:, None, None],
+        "heatmaps": heat[QUADRUPED.mirror_keypoint][..., ::-1], "seen": seen, "view": np.roll(view[::-1], 1), "up": up,
+    }  # fmt: skip
     return constant_network(
         path,
-        {
-            "parts": parts, "surface": surface, "heatmaps": heatmap(CELLS, 32), "seen": np.full(K, 3.0),
-            "view": view, "up": np.array([0.0, -3.0, 0.0]),
-        },
+        {"parts": parts, "surface": surface, "heatmaps": heat, "seen": seen, "view": view, "up": up},
         shape=["n", 6, "s", "s"],
         metadata=about() if metadata is None else metadata,
-    )  # fmt: skip
+        to_the_left=mirrored,
+    )
 
 
 def inputs(**files):

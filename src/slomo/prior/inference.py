@@ -1,15 +1,19 @@
-"""The trained networks through onnxruntime: probabilities of crops."""
+"""The trained networks through onnxruntime: probabilities of crops.
+
+Each crop is looked at as it is and mirrored, and the two answers are averaged: left and right are alike to the network
+then, and what it is unsure of varies less from frame to frame.
+"""
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib import resources
 from pathlib import Path
 
 import numpy as np
 
 from slomo.errors import InvalidData
-from slomo.prior.labels import Labels
+from slomo.prior.labels import Labels, mirror_of
 
 Array = np.ndarray
 
@@ -106,6 +110,23 @@ class Prior:
 
     def __call__(self, crops: Array) -> Prediction:
         """What is seen in crops (F, 6, S, S) float32, made by `crop.network_input`."""
+        return _mean(self._look(crops), self._mirrored(self._look(mirrored_crops(crops))))
+
+    def _mirrored(self, p: Prediction) -> Prediction:
+        """What is said of a mirrored crop, said of the crop."""
+        points, parts = mirror_of(self.keypoints), np.concatenate([[0], 1 + mirror_of(self.parts)])
+        return Prediction(
+            size=p.size,
+            parts=p.parts[:, parts, :, ::-1],
+            surface=p.surface[..., ::-1] * np.array([1, -1, 1], np.float32)[:, None, None],
+            surface_scale=p.surface_scale[..., ::-1],
+            heat=p.heat[:, points, :, ::-1],
+            seen=p.seen[:, points],
+            view=np.roll(p.view[:, ::-1], 1, axis=1),  # bin k is at k steps of azimuth, its mirror image at -k
+            up=p.up * np.array([-1, 1, 1], np.float32),
+        )
+
+    def _look(self, crops: Array) -> Prediction:
         runs = [
             dict(zip(OUTPUTS, self._session.run(OUTPUTS, {self._input: crops[i : i + BATCH]}), strict=True))
             for i in range(0, len(crops), BATCH)
@@ -127,6 +148,19 @@ class Prior:
     @property
     def _input(self) -> str:
         return self._session.get_inputs()[0].name
+
+
+def mirrored_crops(crops: Array) -> Array:
+    """Crops (F, 6, S, S) with left and right exchanged: motion along x changes its sign."""
+    out = crops[..., ::-1].copy()
+    out[:, 4] *= -1
+    return out
+
+
+def _mean(a: Prediction, b: Prediction) -> Prediction:
+    mean = {f.name: (getattr(a, f.name) + getattr(b, f.name)) / 2 for f in fields(Prediction) if f.name != "size"}
+    mean["up"] /= np.maximum(np.linalg.norm(mean["up"], axis=-1, keepdims=True), 1e-6)
+    return Prediction(size=a.size, **mean)
 
 
 def softmax(x: Array, axis: int) -> Array:

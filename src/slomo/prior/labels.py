@@ -62,7 +62,8 @@ class Labels:
         return (u * sign[..., None, :]) @ vt
 
 
-def _mirror(names: Sequence[str]) -> Array:
+def mirror_of(names: Sequence[str]) -> Array:
+    """(N,) index of the name of the other side, its own where there is none."""
     flip = [n.replace("left", "right") if "left" in n else n.replace("right", "left") for n in names]
     return np.array([names.index(f) for f in flip])
 
@@ -78,9 +79,9 @@ def labels(skeleton: Skeleton) -> Labels:
     return Labels(
         kind=skeleton.kind,
         keypoints=skeleton.names,
-        mirror_keypoint=_mirror(skeleton.names),
+        mirror_keypoint=mirror_of(skeleton.names),
         parts=skeleton.part_names,
-        mirror_part=np.concatenate([[0], 1 + _mirror(skeleton.part_names)]),
+        mirror_part=np.concatenate([[0], 1 + mirror_of(skeleton.part_names)]),
         capsule_part=skeleton.capsule_part + 1,
         a=ends[:, 0],
         b=ends[:, 1],

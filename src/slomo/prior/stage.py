@@ -18,7 +18,7 @@ from slomo.stage import Artifact, Inputs, Progress
 
 Array = np.ndarray
 
-VERSION = 2
+VERSION = 3
 
 PRIORS = ("auto", "none")
 
