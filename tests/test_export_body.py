@@ -11,7 +11,8 @@ import trimesh
 from slomo.mesh import SkinnedMesh
 from slomo.raycast import Light, Part, Scene, intrinsics, look_at
 from slomo.reconstruct.body_colours import coloured_by_clip
-from slomo.reconstruct.body_mesh import LEFT, RIGHT, apart, body_mesh, field_mesh
+from slomo.reconstruct.body_mesh import LEFT, RIGHT, body_mesh, field_mesh
+from slomo.reconstruct.fields.canonical import apart
 from slomo.reconstruct.kinematics import Kinematics, Posed
 from slomo.skeleton import list_skeletons, load_skeleton
 
@@ -85,7 +86,11 @@ def test_the_surface_of_a_field_moves_with_the_links(parts):
     origins = straight.nodes[0, 0, : kin.B].numpy().astype(float)
     out = np.array([0.1, 0.02, -0.05])
     surface = SimpleNamespace(
-        vertices=origins + out, faces=np.array([[0, 1, 2]]), colours=np.full((kin.B, 3), 1.0001), weights=np.eye(kin.B)
+        vertices=origins + out,
+        faces=np.array([[0, 1, 2]]),
+        colours=np.full((kin.B, 3), 1.0001),
+        weights=np.eye(kin.B),
+        q=np.zeros((kin.B, 3)),
     )
     mesh = field_mesh(surface, kin, shape, body, np.arange(T) / 30, metres_per_unit=METRES)  # pyright: ignore
     for k in range(T):

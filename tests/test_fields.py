@@ -12,7 +12,7 @@ from slomo.reconstruct import silhouette
 from slomo.reconstruct.fields import mesh as meshing
 from slomo.reconstruct.fields import rays, skinning
 from slomo.reconstruct.fields.background import Background, colours
-from slomo.reconstruct.fields.canonical import BLEND, Capsules, density, rest
+from slomo.reconstruct.fields.canonical import BLEND, Capsules, apart, density, rest
 from slomo.reconstruct.fields.config import FieldsConfig
 from slomo.reconstruct.fields.render import render
 from slomo.reconstruct.fields.terms import Fields
@@ -151,7 +151,11 @@ def test_every_capsules_motion_takes_it_from_rest_to_its_pose(kin: Kinematics):
 
 
 def test_warps_are_the_identity_at_rest_and_under_rigid_motion(kin: Kinematics):
-    _, bones = _posed(kin, torch.zeros(kin.B, 3), rot(2, torch.tensor(0.7)) @ rot(1, torch.tensor(0.4)))
+    _, bones = _posed(
+        kin,
+        torch.as_tensor(apart(kin.skeleton), dtype=torch.float32),
+        rot(2, torch.tensor(0.7)) @ rot(1, torch.tensor(0.4)),
+    )
     x = torch.rand(200, 3, generator=torch.Generator().manual_seed(2)) - 0.5
     dual = skinning.blend(skinning.weights(bones.quadric[0], x), bones.dual[0])
     np.testing.assert_allclose(skinning.forward(dual, x).numpy(), x.numpy(), atol=1e-5)
@@ -333,8 +337,7 @@ def test_the_first_mesh_lies_on_the_capsules_and_follows_the_body(kin: Kinematic
     case = _case(kin, SHARP, q=_bent(kin)[None])
     shape = {k.removeprefix("shape."): v for k, v in case.x.items() if k.startswith("shape.")}
     m = meshing.mesh(case.x, SHARP, kin, shape, cell=0.02)
-    at_rest = rest(kin, shape)
-    sdf = at_rest.capsules.union(torch.as_tensor(m.vertices / SIZE, dtype=torch.float32))
+    sdf = rest(kin, shape).capsules.union(torch.as_tensor(m.vertices / SIZE, dtype=torch.float32))
     assert sdf.abs().max() < 0.006
     np.testing.assert_allclose(m.weights.sum(1), 1, atol=1e-5)
     a, b, c = (m.vertices[m.faces[:, k]] for k in range(3))
@@ -346,8 +349,9 @@ def test_the_first_mesh_lies_on_the_capsules_and_follows_the_body(kin: Kinematic
     posed = Capsules(s.body.a[0, 2], s.body.b[0, 2], s.body.radii[0])
     off = posed.distances(torch.as_tensor(x[1], dtype=torch.float32)).amin(-1).abs() / SIZE
     assert off.median() < 0.02  # skin at bent joints leaves the cones
-    still = case.problem.kin.pose(shape, s.body.nodes[:, :, 0], s.R_root, torch.zeros_like(s.q))
-    x = meshing.posed(m, kin, shape, still, s.R_root, torch.zeros_like(s.q), torch.tensor([1]))[0]
+    at_rest = torch.as_tensor(m.q, dtype=torch.float32).expand_as(s.q)
+    still = case.problem.kin.pose(shape, s.body.nodes[:, :, 0], s.R_root, at_rest)
+    x = meshing.posed(m, kin, shape, still, s.R_root, at_rest, torch.tensor([1]))[0]
     want = m.vertices @ s.R_root[0, 1].numpy().T + s.body.nodes[0, 1, 0].numpy()
     np.testing.assert_allclose(x, want, atol=1e-5)
 

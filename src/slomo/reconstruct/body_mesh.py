@@ -8,8 +8,8 @@ import torch
 
 from slomo import flesh
 from slomo.mesh import SkinnedMesh, heaviest
+from slomo.reconstruct.fields.canonical import apart
 from slomo.reconstruct.kinematics import Kinematics, Posed
-from slomo.skeleton import Skeleton
 
 if TYPE_CHECKING:
     from slomo.reconstruct.fields.mesh import BodyMesh
@@ -19,7 +19,6 @@ Array = np.ndarray
 # In radii of the capsules (their median): cell of the grid, how far surfaces flow into each other, how far a link's
 # hold on the skin reaches past its own flesh.
 CELL, BLEND, REACH = 0.2, 0.15, 0.25
-APART = 0.8  # rad at most by which limbs stand off in the pose of the skin, so that they do not grow together
 MIDDLE, LEFT, RIGHT = (0.72, 0.70, 0.66), (0.90, 0.62, 0.0), (0.34, 0.71, 0.91)  # sRGB
 
 
@@ -30,18 +29,6 @@ def link_frames(body: Posed, metres_per_unit: float) -> Array:
     T[..., :3, :3] = R
     T[..., :3, 3] = body.nodes[0, :, : R.shape[1]].detach().cpu().numpy() * metres_per_unit
     return T
-
-
-def apart(skeleton: Skeleton) -> Array:
-    """(B, 3) rad: the rest pose with each limb swung outwards by half its range, `APART` at most."""
-    q = np.zeros((skeleton.link_count, 3))
-    for j in range(1, skeleton.link_count):
-        parent = skeleton.link[j]
-        if skeleton.mirror[j] != j and skeleton.mirror[parent] == parent:
-            side = np.sign(skeleton.offset[j, 1])
-            reach = skeleton.upper[j, 0] if side > 0 else -skeleton.lower[j, 0]
-            q[j, 0] = side * min(APART, reach / 2)
-    return q
 
 
 def bind_pose(kin: Kinematics, shape: Mapping[str, torch.Tensor], q: Array) -> Posed:
@@ -88,7 +75,7 @@ def field_mesh(
     Files know linear blend skinning alone; the field itself is posed by dual quaternions, which keep more of its volume
     where a joint bends far.
     """
-    bind = bind_pose(kin, shape, np.zeros((kin.B, 3)))
+    bind = bind_pose(kin, shape, surface.q)
     vertices = surface.vertices * metres_per_unit
     return _moved(kin, bind, body, t, vertices, surface.faces, surface.colours, surface.weights, metres_per_unit)
 

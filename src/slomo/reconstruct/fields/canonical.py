@@ -1,16 +1,20 @@
 """The body at rest: the union of the skeleton's capsules with its present shape, and the density of a surface.
 
-Lengths are body lengths, the origin is the root, x forward, y left, z up.
+Lengths are body lengths, the origin is the root, x forward, y left, z up. Rest here is the skeleton's with its limbs
+swung outwards: limbs that touch would be one piece of surface and tear when they part.
 """
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from slomo.reconstruct.kinematics import Kinematics
+from slomo.skeleton import Skeleton
 
 Tensor = torch.Tensor
 
+APART = 0.8  # rad at most by which limbs are swung outwards at rest
 BLEND = 0.01  # body lengths over which capsules flow into each other
 
 
@@ -45,19 +49,33 @@ class Capsules:
 
 @dataclass(frozen=True)
 class Rest:
-    """The rest pose of a shape: its capsules, and the links' origins (B, 3)."""
+    """The rest pose of a shape: its capsules, the links' origins (B, 3), and all joints' angles q (B, 3) rad."""
 
     capsules: Capsules
     origins: Tensor
+    q: Tensor
+
+
+def apart(skeleton: Skeleton) -> np.ndarray:
+    """(B, 3) rad: the skeleton's rest pose with each limb swung outwards by half its range, `APART` at most."""
+    q = np.zeros((skeleton.link_count, 3))
+    for j in range(1, skeleton.link_count):
+        parent = skeleton.link[j]
+        if skeleton.mirror[j] != j and skeleton.mirror[parent] == parent:
+            side = np.sign(skeleton.offset[j, 1])
+            reach = skeleton.upper[j, 0] if side > 0 else -skeleton.lower[j, 0]
+            q[j, 0] = side * min(APART, reach / 2)
+    return q
 
 
 def rest(kin: Kinematics, shape: dict[str, Tensor]) -> Rest:
     """The skeleton at rest with the shape of one hypothesis, differentiable in it."""
     zero = next(iter(shape.values())).new_zeros
     eye = torch.eye(3, dtype=torch.float32, device=zero(1).device).expand(1, 1, 3, 3)
-    body = kin.pose(shape, zero(1, 1, 3), eye, zero(1, 1, kin.B, 3))
+    q = torch.as_tensor(apart(kin.skeleton), dtype=torch.float32, device=eye.device)
+    body = kin.pose(shape, zero(1, 1, 3), eye, q[None, None])
     L = body.length[0]
-    return Rest(Capsules(body.a[0, 0] / L, body.b[0, 0] / L, body.radii[0] / L), body.nodes[0, 0, : kin.B] / L)
+    return Rest(Capsules(body.a[0, 0] / L, body.b[0, 0] / L, body.radii[0] / L), body.nodes[0, 0, : kin.B] / L, q)
 
 
 def density(sdf: Tensor, beta: Tensor) -> Tensor:

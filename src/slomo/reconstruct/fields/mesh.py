@@ -29,7 +29,7 @@ class BodyMesh:
 
     Attributes:
         vertices: (V, 3) world units. faces: (F, 3), counter-clockwise from outside. colours: (V, 3) sRGB in [0, 1].
-        weights: (V, B) of the links, rows sum to 1. origins: (B, 3) of the links at rest, unrotated.
+        weights: (V, B) of the links, rows sum to 1. q: (B, 3) rad, the joints' angles at rest, see `canonical.apart`.
         capsule_weights: (V, C), what `posed` needs.
     """
 
@@ -37,7 +37,7 @@ class BodyMesh:
     faces: Array
     colours: Array
     weights: Array
-    origins: Array
+    q: Array
     capsule_weights: Array
 
 
@@ -77,7 +77,7 @@ def mesh(
         of_links = of_capsules.new_zeros(len(x), kin.B).index_add(1, kin.c_link.to(x.device), of_capsules)
         L = float(shape["log_length"].exp()[0])
     f = lambda y: y.cpu().numpy().astype(float)  # noqa: E731
-    return BodyMesh(place * L, triangles, f(torch.cat(colours)), f(of_links), f(body.origins) * L, f(of_capsules))
+    return BodyMesh(place * L, triangles, f(torch.cat(colours)), f(of_links), f(body.q), f(of_capsules))
 
 
 def posed(

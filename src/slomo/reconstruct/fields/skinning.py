@@ -138,7 +138,8 @@ def bones(kin: Kinematics, body: Posed, R_root: Tensor, q: Tensor, at: Tensor, r
     R, p = R_root[0, at], body.nodes[0, at, 0]
     local = lambda x: ((x[0, at] - p[:, None]) @ R) / L  # noqa: E731
     capsules = Capsules(local(body.a), local(body.b), rest.capsules.radii)
-    real = rotations(kin, q[0, at])
+    still = rotations(kin, rest.q[None]) * q.new_tensor([1.0, -1.0, -1.0, -1.0])
+    real = product(rotations(kin, q[0, at]), still)
     shift = local(body.nodes[:, :, : kin.B]) - turn(real, rest.origins.expand(len(at), -1, -1))
     dual = 0.5 * product(torch.cat([torch.zeros_like(shift[..., :1]), shift], -1), real)
     return Bones(capsules, quadric(capsules), torch.cat([real, dual], -1)[:, kin.c_link])
