@@ -6,15 +6,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from slomo.reconstruct import losses, silhouette
+from slomo.reconstruct import losses, silhouette, standing
 from slomo.reconstruct.kinematics import Posed
 from slomo.reconstruct.problem import Draw, Problem
 from slomo.reconstruct.run import Run
 
 Array = np.ndarray
-
-STANDS_HEIGHT = 0.06  # body lengths above its stance height at which a foot is as likely up as down
-STANDS_SPEED = 0.6  # body lengths / s, likewise
 
 
 @dataclass(frozen=True)
@@ -37,12 +34,16 @@ def assess(problem: Problem, run: Run, metres: float) -> Outcome:
     with torch.no_grad():
         shape = {k.removeprefix("shape."): v for k, v in run.x.items() if k.startswith("shape.")}
         position, R, q = problem.path(run.x, run.guess, shape["log_length"].exp(), every)
-        body = kin.pose(shape, position, R, q)
         R_cam, centre = problem.cameras(run.x["tilt"], every)
         own = own_length(problem, shape)
         per_unit = metres / own
+        free = kin.pose(shape, position, R, q).nodes[0].numpy().astype(float)
+        t, feet = obs.t.numpy().astype(float), free[:, list(skeleton.contacts)]
+        contact = standing.contact_probability(feet, free[:, 0], t, own, skeleton.sole)
+        ground = skeleton.sole * float(shape["log_length"].exp()[0])
+        q = standing.stand(kin, shape, position, R, q, standing.places(feet, contact, t, ground))
+        body = kin.pose(shape, position, R, q)
         nodes = body.nodes[0].numpy().astype(float)
-        contact = _contact(nodes[:, list(skeleton.contacts)], obs.t.numpy(), own, skeleton.sole)
         iou, error, frame_iou = _overlap(problem, run)
         confidence = _confidence(problem, body, R_cam, centre, frame_iou)
         loss, parts = problem.loss(run.x, run.guess, problem.draw(48, 400, torch.Generator().manual_seed(11)))
@@ -111,14 +112,6 @@ def own_length(problem: Problem, shape: dict[str, torch.Tensor]) -> float:
         return float(np.linalg.norm(p[a] - p[b]))
     sole = skeleton.sole * float(shape["log_length"].exp()[0])
     return float(p[:, 2].max() - np.mean([p[c, 2] for c in skeleton.contacts]) + sole)
-
-
-def _contact(feet: Array, t: Array, length: float, sole: float) -> Array:
-    """(T, F) probability from height and speed: logistic in each."""
-    height = feet[..., 2] / length - sole
-    v = np.linalg.norm(np.gradient(feet, t, axis=0)[..., :2], axis=-1) / length
-    up = 1 / (1 + np.exp(-(STANDS_HEIGHT - height) / (STANDS_HEIGHT / 4)))
-    return up / (1 + np.exp(-(STANDS_SPEED - v) / (STANDS_SPEED / 4)))
 
 
 def _skate(feet: Array, contact: Array, t: Array) -> float:

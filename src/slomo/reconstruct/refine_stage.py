@@ -11,7 +11,7 @@ from slomo.reconstruct.outcome import Outcome, assess
 from slomo.reconstruct.run import from_arrays
 from slomo.stage import Artifact, Inputs, Progress
 
-REFINE_VERSION = 1
+REFINE_VERSION = 2
 
 # The rest pose at the right place overlaps by 0.5 to 0.6, a fit that is right by 0.75 and more. Below this the body is
 # elsewhere or another shape in many frames, and its key points do not follow the subject.
@@ -20,8 +20,7 @@ MIN_IOU = 0.45
 
 @dataclass(frozen=True)
 class ReconstructConfig(FitConfig):
-    """Parameters of the reconstruction: those of the fit, and of its refinement.
-    """
+    """Parameters of the reconstruction: those of the fit, and of its refinement."""
 
 
 def run_refine(inputs: Inputs, config: ReconstructConfig, progress: Progress) -> Artifact:
