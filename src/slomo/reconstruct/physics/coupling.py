@@ -1,7 +1,7 @@
 """Coordinate descent between the picture and the physics (PPR, Yang et al. 2023, sec. 3.3): the fit's side of it.
 
-A round takes the fitted motion, learns controls with which the simulated body follows it, and hands the simulated motion
-back as one more term of the fit: the fitted body is drawn towards a motion that gravity, friction and the ground allow.
+A round takes the fitted motion, learns controls with which the simulated body follows it, and hands the simulated
+motion back as one more term of the fit: the body is drawn towards a motion that gravity, friction and the ground allow.
 """
 
 from collections.abc import Mapping
@@ -33,14 +33,20 @@ class Physics:
         self.problem, self.metres, self.config = problem, metres, config
         self.mechanics = mechanics or Mechanics()
         self._variables: Variables | None = None
+        self._base: Kinematic | None = None
 
     def arrays(self) -> dict[str, Array]:
         """The state, for a checkpoint."""
-        return {k: v.numpy().copy() for k, v in (self._variables or {}).items()}
+        if self._variables is None or self._base is None:
+            return {}
+        learned = {f"learned.{k}": v.numpy().copy() for k, v in self._variables.items()}
+        return learned | {f"base.{k}": v for k, v in vars(self._base).items()}
 
     def restore(self, arrays: Mapping[str, Array]) -> None:
         """Go on from `arrays()`."""
-        self._variables = {k: torch.from_numpy(np.array(v)) for k, v in arrays.items()} or None
+        part = lambda name: {k.removeprefix(name): np.array(v) for k, v in arrays.items() if k.startswith(name)}  # noqa: E731
+        self._variables = {k: torch.from_numpy(v) for k, v in part("learned.").items()} or None
+        self._base = Kinematic(**part("base.")) if arrays else None
 
     def round(self, x: FitVariables, guess: Guess, iterations: int | None = None) -> tuple[Simulated, float]:
         """Learn to follow the motion of one hypothesis, and simulate it.
@@ -52,8 +58,11 @@ class Physics:
             The simulated motion in metres, and metres per world unit of the fit.
         """
         body, kinematic, unit = self.body(x, guess)
-        learner = Learner(body, kinematic, self.problem.kin.skeleton.mirror[: len(body.parent)], self.config)
+        mirror = self.problem.kin.skeleton.mirror[: len(body.parent)]
         c, first = self.config, self._variables is None
+        if first:
+            self._base = kinematic
+        learner = Learner(body, kinematic, mirror, c, base=self._base)
         n = iterations or (c.iterations if first else max(1, c.iterations // 3))
         high, low = c.assistance
         falling = high * (low / high) ** np.clip(np.arange(n) / max(n * 2 / 3, 1), 0, 1)

@@ -64,14 +64,24 @@ class Simulated:
 
 
 class Learner:
-    """Follows one kinematic trajectory with one body; `variables` are plain tensors and go from round to round."""
+    """Follows one kinematic trajectory with one body.
 
-    def __init__(self, body: Body, kinematic: Kinematic, mirror: Array, config: PhysicsConfig, device: str = "cpu"):
-        """mirror: (B,) link on the other side."""
+    What is learned are corrections to a trajectory `base`, the kinematic one of the first round: when the trajectory that
+    is followed changes between rounds, the simulated one, which is unstable, does not.
+
+    Args:
+        mirror: (B,) link on the other side. base: default `kinematic`.
+    """
+
+    def __init__(
+        self, body: Body, kinematic: Kinematic, mirror: Array, config: PhysicsConfig, *,
+        base: Kinematic | None = None, device: str = "cpu",
+    ):  # fmt: skip
         self.body, self.kinematic, self.config = body, kinematic, config
         c = config
         self.windows: Windows = cover(kinematic.t, length=c.window, overlap=c.overlap, dt=c.dt, knot=c.knot)
         self.guides: Guides = guides(kinematic, self.windows)
+        self.base: Guides = guides(base, self.windows) if base else self.guides
         self.roll = RollOut(body, self.windows.step, steps=self.windows.steps, dt=self.windows.dt, device=device)
         self.mirror = torch.as_tensor(mirror)
         here = torch.as_tensor(self.windows.frame >= 0, dtype=torch.float32)
@@ -90,7 +100,7 @@ class Learner:
 
     def controls(self, x: Mapping[str, Tensor], assistance: float) -> Controls:
         """What the variables say, in SI units."""
-        body, g, m, N = self.body, self.guides, self.body.mechanics, self.windows.count
+        body, g, m, N = self.body, self.base, self.body.mechanics, self.windows.count
         L, pace = body.length, float(np.sqrt(body.length / GRAVITY))
         s = {k: SPREAD[k] * v for k, v in x.items()}
         bend = torch.einsum("sk,nkbi->nsbi", self.windows.basis, s["knots"])
@@ -109,8 +119,8 @@ class Learner:
             # A larger body is the same body at a slower time: less gravity at the given size.
             gravity=wide(GRAVITY * (-s["log_size"]).exp()),
             assistance=torch.full((N,), assistance),
-            guide_position=g.position,
-            guide_quaternion=g.quaternion,
+            guide_position=self.guides.position,
+            guide_quaternion=self.guides.quaternion,
         )  # fmt: skip
 
     def distance(self, nodes: Tensor) -> Tensor:
