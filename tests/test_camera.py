@@ -48,7 +48,14 @@ def angle_between(A: np.ndarray, B: np.ndarray) -> np.ndarray:
 
 
 def settings(focal: float, **changes) -> CameraSettings:
-    defaults = {"refine_focal": True, "key_every": 3, "features": 1200, "overlap": 5, "seed": 0}
+    defaults = {
+        "focal_std": 0.2 * focal,
+        "refine_focal": True,
+        "key_every": 3,
+        "features": 1200,
+        "overlap": 5,
+        "seed": 0,
+    }
     return CameraSettings(focal=focal, **(defaults | changes))
 
 

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from slomo.reconstruct.certainty import fit_plane, plane_std
+
 
 @dataclass(frozen=True)
 class Plane:
@@ -12,7 +14,7 @@ class Plane:
 
     Attributes:
         inliers: (P,) bool, points on it.  support: their share of all weight.
-        tilt_std: rad, standard deviation of the normal's direction along the weaker axis.
+        tilt_std: rad, standard deviation of the normal's direction, see `certainty.plane_std`.
     """
 
     normal: np.ndarray
@@ -62,16 +64,12 @@ def find_ground(
         on = abs(points @ normal - offset) < 1.5 * tolerance
         if on.sum() < 8:
             return None
-        w = (weights / tolerance**2)[on]
-        mean = np.average(points[on], axis=0, weights=w)
-        spread = (points[on] - mean) * np.sqrt(w)[:, None]
-        fitted = np.linalg.svd(spread, full_matrices=False)[2][2]
+        fitted, mean = fit_plane(points[on], (weights / tolerance**2)[on])
         normal = fitted * np.sign(fitted @ up or 1.0)
         offset = float(normal @ mean)
     on = abs(points @ normal - offset) < 1.5 * tolerance
-    flat = points[on] - points[on].mean(0)
-    extent, noise = np.linalg.svd(flat, compute_uv=False)[1], np.std(flat @ normal)
-    return Plane(normal, offset, on, float(weights[on].sum() / weights.sum()), float(noise / max(extent, 1e-12)))
+    std = plane_std(points[on], (weights / tolerance**2)[on], normal)
+    return Plane(normal, offset, on, float(weights[on].sum() / weights.sum()), std)
 
 
 def _likely(up: np.ndarray) -> float:

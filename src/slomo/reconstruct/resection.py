@@ -14,20 +14,20 @@ _MIN_POINTS = 12
 def camera_path(frames: np.ndarray, structure: Structure, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """T_world_cam (T, 4, 4) of all frames and (T,) bool, which of them were measured and not interpolated."""
     T = len(frames)
-    gray = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames]
     known = dict(zip(structure.frames.tolist(), structure.T_world_cam, strict=True))
     sightings: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in range(T)]
     rows = {int(f): np.flatnonzero(structure.observations[:, 0] == n) for n, f in enumerate(structure.frames)}
     for order in (range(T), range(T - 1, -1, -1)):
-        xy, ids, before = np.zeros((0, 2)), np.zeros(0, int), -1
+        xy, ids, before = np.zeros((0, 2)), np.zeros(0, int), np.zeros((0, 0), np.uint8)
         for t in order:
+            image = cv2.cvtColor(frames[t], cv2.COLOR_RGB2GRAY)
             if t in known:
                 xy, ids = structure.xy[rows[t]], structure.observations[rows[t], 1]
             elif len(xy):
-                xy, good = follow(gray[before], gray[t], xy)
+                xy, good = follow(before, image, xy)
                 xy, ids = xy[good], ids[good]
                 sightings[t].append((xy, ids))
-            before = t
+            before = image
     for t in range(T):
         if t not in known and sightings[t]:
             xy, ids = (np.concatenate(column) for column in zip(*sightings[t], strict=True))

@@ -6,6 +6,7 @@ the work is handed over, and `python -m slomo.reconstruct.sfm DIR` is what runs 
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -19,12 +20,15 @@ import numpy as np
 
 from slomo.errors import StageFailed
 
+_PREFIX = "slomo-sfm-"  # of folders for temporary files; the id of the process that made it follows
+
 ENOUGH = 0.6  # part of the key frames that a model must hold to be used
 # Degrees between rays, of the first pair and of any point. COLMAP's usual ones give the better structure; a hand-held
 # clip that turns more than it travels has no points left at those.
 _ANGLES = ((16.0, 1.5), (4.0, 0.4))
 _ENOUGH_POINTS = 10  # points for each key frame, below which the next angles are tried
-_MAX_SECONDS = 90
+_MAX_SECONDS = 90  # of a mapping, and at least
+_MAX_SECONDS_EACH = 2.0  # for each key frame
 
 
 @dataclass(frozen=True)
@@ -75,7 +79,8 @@ def reconstruct_structure(
     """
     import cv2
 
-    with tempfile.TemporaryDirectory(prefix="slomo-sfm-") as folder:
+    _remove_orphans()
+    with tempfile.TemporaryDirectory(prefix=f"{_PREFIX}{os.getpid()}-") as folder:
         root = Path(folder)
         (root / "images").mkdir()
         (root / "masks").mkdir()
@@ -108,17 +113,36 @@ def reconstruct_structure(
         return Structure(**arrays)
 
 
-def _end_with(parent: int) -> None:
-    """End this process when its parent has gone, even by SIGKILL."""
+def _remove_orphans() -> None:
+    """Remove what killed processes left in the folder for temporary files."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+        owner = folder.name.removeprefix(_PREFIX).split("-")[0]
+        if owner.isdecimal() and not _alive(int(owner)):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True  # of another user
+    return True
+
+
+def _end_with(parent: int, folder: str) -> None:
+    """End this process when its parent has gone, even by SIGKILL, and tidy up in its place."""
     while os.getppid() == parent:
         time.sleep(0.5)
+    shutil.rmtree(folder, ignore_errors=True)
     os._exit(1)
 
 
 def _main(folder: str) -> None:
     import pycolmap
 
-    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    threading.Thread(target=_end_with, args=(os.getppid(), folder), daemon=True).start()
     root = Path(folder)
     job = json.loads((root / "job.json").read_text())
     pycolmap.logging.minloglevel = 2
@@ -155,7 +179,7 @@ def _main(folder: str) -> None:
         mapping.num_threads, mapping.random_seed = job["threads"], job["seed"]
         # A first pair that leads nowhere is dropped and another is tried, which only happens with several models.
         mapping.multiple_models, mapping.max_num_models, mapping.extract_colors = True, 3, False
-        mapping.max_runtime_seconds = _MAX_SECONDS
+        mapping.max_runtime_seconds = round(max(_MAX_SECONDS, _MAX_SECONDS_EACH * count))
         mapping.mapper.filter_min_tri_angle = mapping.triangulation.min_angle = angle
         mapping.mapper.init_min_tri_angle = first_angle
         mapping.ba_refine_focal_length = job["refine_focal"]

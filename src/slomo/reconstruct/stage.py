@@ -13,8 +13,8 @@ from slomo.reconstruct.video import decode
 from slomo.stage import Artifact, Inputs, Progress
 
 DECODE_VERSION = 2
-MASKS_VERSION = 2
-CAMERA_VERSION = 2
+MASKS_VERSION = 3
+CAMERA_VERSION = 3
 
 SEGMENTERS = ("auto", "u2netp", "motion", "user")
 
@@ -36,7 +36,7 @@ class DecodeConfig:
     duration: float = 0.0
     fps: float = 30.0
     max_side: int = 640
-    megapixels: float = 420.0
+    megapixels: float = 300.0
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,15 @@ class MasksConfig:
         segmenter: "auto" (the user's masks when given, else u2netp when its weights are at hand, else motion),
             "u2netp", "motion" or "user".
         network_every: the network runs on every n-th frame; flow fills the frames between.
+        subject_at: (u, v) or (u, v, s), a pixel of the upright clip on the subject, and when; without a time, in the
+            first frame used. Empty: the largest.
+        subject_box: (u0, v0, u1, v1) or with a time, a box around it instead.
     """
 
     segmenter: str = "auto"
     network_every: int = 3
+    subject_at: tuple[float, ...] = ()
+    subject_box: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -60,15 +65,16 @@ class CameraConfig:
     Attributes:
         fov_deg: degrees, horizontal field of view; 0 means unknown: taken from the clip's metadata where there is one,
             else `default_fov_deg`, and refined where the motion shows it. A given one is kept.
-        default_fov_deg: degrees, horizontal, where nothing else is known.
-        key_every: every n-th frame goes through structure from motion.
+        default_fov_deg: degrees, along the frames' longer side, where nothing else is known: between phones (55 to 65)
+            and what was zoomed in.
+        key_every: every n-th frame goes through structure from motion; fewer do of a clip that has more than 120 such.
         features: features a key frame.
         overlap: key frames with which each is matched.
         seed: of every random choice.
     """
 
     fov_deg: float = 0.0
-    default_fov_deg: float = 60.0
+    default_fov_deg: float = 53.0
     key_every: int = 3
     features: int = 1200
     overlap: int = 5
@@ -155,18 +161,14 @@ def run_camera(inputs: Inputs, config: CameraConfig, progress: Progress) -> Arti
     decoded = inputs.artifacts["decode"]
     frames, t = decoded.npz["frames.npz"]["frames"], decoded.npz["frames.npz"]["t"]
     masks = unpack(inputs.artifacts["masks"].npz["masks.npz"])
-    width = frames.shape[2]
     for name in ("fov_deg", "default_fov_deg"):
         value = getattr(config, name)
         if not (0 < value < 170 or (value == 0 and name == "fov_deg")):
             raise UsageError(f"is {value}", where=f"camera.{name}", valid=["more than 0 and less than 170 degrees"])
-    hint = decoded.json["video.json"].get("focal_px_hint", 0.0)
-    focal = 0.5 * width / np.tan(0.5 * np.radians(config.fov_deg or config.default_fov_deg))
-    source = "given" if config.fov_deg else "default"
-    if hint and not config.fov_deg:
-        focal, source = hint, "the clip's metadata"
+    focal, share, source = _focal(config, decoded.json["video.json"].get("focal_px_hint", 0.0), frames.shape[1:3])
     settings = CameraSettings(
-        focal=float(focal),
+        focal=focal,
+        focal_std=share * focal,
         refine_focal=not config.fov_deg,
         key_every=config.key_every,
         features=config.features,
@@ -176,6 +178,15 @@ def run_camera(inputs: Inputs, config: CameraConfig, progress: Progress) -> Arti
     path = estimate_camera(frames, masks, t, settings, progress)
     report = path.report | {"focal_source": "refined" if path.report["focal_observed"] else source}
     return Artifact(npz={"camera.npz": {"K": path.K, "T_world_cam": path.T_world_cam}}, json={"report.json": report})
+
+
+def _focal(config: CameraConfig, hint: float, size: tuple[int, int]) -> tuple[float, float, str]:
+    """Focal length (px) to begin with, its standard deviation relative to it, and where it comes from."""
+    if config.fov_deg:
+        return 0.5 * size[1] / float(np.tan(0.5 * np.radians(config.fov_deg))), 0.0, "given"
+    if hint:
+        return hint, 0.05, "the clip's metadata"
+    return 0.5 * max(size) / float(np.tan(0.5 * np.radians(config.default_fov_deg))), 0.2, "default"
 
 
 def pack(masks: np.ndarray) -> dict[str, np.ndarray]:

@@ -33,15 +33,23 @@ class Tracks:
         k, track, xy = place[self.frame[keep]], self.track[keep], self.xy[keep]
         order = np.lexsort((k, track))
         k, track, xy = k[order], track[order], xy[order]
+        # Both sorted by track, then place: a track that ends does not run on into the next one.
+        width = int(k.max(initial=0)) + max(gaps) + 1
+        code = track * width + k
         which, first, second = [], [], []
-        index = {(int(a), int(b)): i for i, (a, b) in enumerate(zip(track, k, strict=True))}
         for gap in gaps:
-            hit = [(i, index.get((int(a), int(b) + gap), -1)) for i, (a, b) in enumerate(zip(track, k, strict=True))]
-            found = np.array([h for h in hit if h[1] >= 0], dtype=int).reshape(-1, 2)
-            which.append(np.column_stack([k[found[:, 0]], k[found[:, 1]]]))
-            first.append(xy[found[:, 0]])
-            second.append(xy[found[:, 1]])
+            at = np.searchsorted(code, code + gap).clip(max=len(code) - 1)
+            here = np.flatnonzero(code[at] == code + gap)
+            there = at[here]
+            which.append(np.column_stack([k[here], k[there]]))
+            first.append(xy[here])
+            second.append(xy[there])
         return np.concatenate(which), np.concatenate(first), np.concatenate(second)
+
+    def rows_by_frame(self, T: int) -> list[np.ndarray]:
+        """Indices of the observations in each of T frames, by increasing track."""
+        order = np.lexsort((self.track, self.frame))
+        return np.split(order, np.searchsorted(self.frame[order], np.arange(1, T)))
 
 
 def follow(a: np.ndarray, b: np.ndarray, xy: np.ndarray, guess: np.ndarray | None = None):
@@ -61,21 +69,22 @@ def follow(a: np.ndarray, b: np.ndarray, xy: np.ndarray, guess: np.ndarray | Non
 
 def background_tracks(frames: np.ndarray, masks: np.ndarray, *, corners: int = 500, progress=lambda f: None) -> Tracks:
     """Corners of (T, H, W, 3) uint8 RGB frames outside (T, H, W) masks, topped up to `corners` in every frame."""
-    gray = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames]
-    side = max(gray[0].shape)
+    side = max(frames.shape[1:3])
     around = np.ones((max(3, side // 40) | 1,) * 2, np.uint8)
-    free = [cv2.dilate(m.astype(np.uint8), around) == 0 for m in masks]
     distance = side / 70
+    before = np.zeros((0, 0), np.uint8)
     xy, ids, count = np.zeros((0, 2), np.float32), np.zeros(0, int), 0
     seen: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    for t, image in enumerate(gray):
+    for t, (frame, mask) in enumerate(zip(frames, masks, strict=True)):
+        image = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
+        free = cv2.dilate(mask.astype(np.uint8), around) == 0
         if t:
-            xy, good = follow(gray[t - 1], image, xy)
+            xy, good = follow(before, image, xy)
             col, row = xy.round().astype(int).T.clip(0)
-            good &= free[t][row.clip(0, image.shape[0] - 1), col.clip(0, image.shape[1] - 1)]
+            good &= free[row.clip(0, image.shape[0] - 1), col.clip(0, image.shape[1] - 1)]
             xy, ids = xy[good], ids[good]
         if len(xy) < 0.8 * corners:
-            room = free[t].astype(np.uint8) * 255
+            room = free.astype(np.uint8) * 255
             for x, y in xy:
                 cv2.circle(room, (int(x), int(y)), int(distance), 0, -1)
             new = cv2.goodFeaturesToTrack(image, corners - len(xy), 0.005, distance, mask=room)
@@ -84,5 +93,6 @@ def background_tracks(frames: np.ndarray, masks: np.ndarray, *, corners: int = 5
                 ids = np.concatenate([ids, count + np.arange(len(new))])
                 count += len(new)
         seen.append((np.full(len(xy), t), ids.copy(), xy.copy()))
-        progress((t + 1) / len(gray))
+        before = image
+        progress((t + 1) / len(frames))
     return Tracks(*(np.concatenate(column) for column in zip(*seen, strict=True)))

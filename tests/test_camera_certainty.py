@@ -1,0 +1,135 @@
+"""What is said of the camera's certainty, long clips, and backgrounds that say little."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from slomo.reconstruct import certainty, sfm
+from slomo.reconstruct.camera import _key_frames, estimate_camera
+from slomo.reconstruct.tracks import Tracks
+from slomo.stage import Silent
+from test_camera import pan, settings, turned_views
+
+CENTER = np.array([159.5, 119.5])
+
+
+def structure(noise: float, cameras: int = 5, points: int = 40) -> sfm.Structure:
+    """Cameras on an arc around random points, all of which they see; px errors of `noise`."""
+    rng = np.random.default_rng(3)
+    X = rng.uniform(-1, 1, (points, 3))
+    T = np.tile(np.eye(4), (cameras, 1, 1))
+    for T_c, angle in zip(T, np.linspace(-0.3, 0.3, cameras), strict=True):
+        T_c[:3, :3] = Rotation.from_euler("y", -angle).as_matrix()
+        T_c[:3, 3] = [4 * np.sin(angle), 0, -4 * np.cos(angle)]
+    seen = np.stack(np.meshgrid(np.arange(cameras), np.arange(points), indexing="ij"), -1).reshape(-1, 2)
+    local = np.einsum("mji,mj->mi", T[seen[:, 0], :3, :3], X[seen[:, 1]] - T[seen[:, 0], :3, 3])
+    xy = 300 * local[:, :2] / local[:, 2:] + CENTER + rng.normal(0, noise, (len(seen), 2))
+    return sfm.Structure(np.arange(cameras), T, 300.0, X, seen, xy, noise, 1.5)
+
+
+def test_derivatives_of_a_sighting_against_finite_differences():
+    s = structure(0.0, cameras=3, points=4)
+    _, by_pose, by_focal, by_point = certainty._linearise(s, CENTER)
+    e = 1e-6
+
+    def residual(turn=(0, 0, 0), shift=(0, 0, 0), move=(0, 0, 0), focal=0.0):
+        T = s.T_world_cam.copy()
+        # The turn and shift are of the points in the camera frame: exp(turn) X + shift.
+        inverse = np.linalg.inv(T)
+        inverse[:, :3, :] = Rotation.from_rotvec(turn).as_matrix() @ inverse[:, :3, :]
+        inverse[:, :3, 3] += shift
+        moved = sfm.Structure(
+            s.frames, np.linalg.inv(inverse), s.focal + focal, s.points + move, s.observations, s.xy, 0.0, 1.5
+        )
+        return certainty._linearise(moved, CENTER)[0]
+
+    for name, jacobian in (("turn", by_pose[..., :3]), ("shift", by_pose[..., 3:]), ("move", by_point)):
+        for axis in range(3):
+            step = e * np.eye(3)[axis]
+            numeric = (residual(**{name: step}) - residual(**{name: -step})) / (2 * e)
+            np.testing.assert_allclose(jacobian[..., axis], numeric, rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(by_focal, (residual(focal=e) - residual(focal=-e)) / (2 * e), rtol=1e-5, atol=1e-6)
+
+
+def test_focal_certainty_is_that_of_the_whole_bundle_adjustment():
+    s = structure(0.4)
+    r, by_pose, by_focal, by_point = certainty._linearise(s, CENTER)
+    N, P = len(s.frames), len(s.points)
+    J = np.zeros((len(r), 2, 1 + 6 * N + 3 * P))
+    for row, (n, p) in enumerate(s.observations):
+        J[row, :, 0] = by_focal[row]
+        J[row, :, 1 + 6 * n : 7 + 6 * n] = by_pose[row]
+        J[row, :, 1 + 6 * N + 3 * p : 4 + 6 * N + 3 * p] = by_point[row]
+    J = J.reshape(-1, J.shape[-1])
+    covariance = np.linalg.pinv(J.T @ J, rcond=1e-10) * (1.4826 * np.median(abs(r))) ** 2
+    expected = np.sqrt(covariance[0, 0] * certainty._DEPENDENT)
+    assert certainty.focal_std(s, CENTER) == pytest.approx(expected, rel=1e-3)
+
+
+def test_certainty_of_a_plane_is_its_spread_over_draws():
+    rng = np.random.default_rng(0)
+    said, tilts = [], []
+    for _ in range(60):
+        X = np.column_stack([rng.uniform(-2, 2, (120, 2)), rng.normal(0, 0.05, 120)])
+        n, _ = certainty.fit_plane(X, np.ones(120))
+        n *= np.sign(n[2])
+        said.append(certainty.plane_std(X, np.ones(120), n))
+        tilts.append(np.arccos(n[2]))
+    assert np.mean(said) == pytest.approx(np.sqrt(np.mean(np.square(tilts))), rel=0.4)
+    bent = X.copy()
+    bent[:, 2] += 0.2 * np.abs(X[:, 0])  # a fold is no noise, yet makes up uncertain
+    n, _ = certainty.fit_plane(bent, np.ones(120))
+    assert certainty.plane_std(bent, np.ones(120), n * np.sign(n[2])) > 2 * np.mean(said)
+
+
+@pytest.mark.parametrize(("seconds", "fps", "most"), [(3, 30, 31), (20, 30, 121), (60, 15, 151), (600, 12, 1201)])
+def test_key_frames_are_bounded_and_near_each_other(seconds, fps, most):
+    t = np.arange(seconds * fps) / fps
+    keys, gaps = _key_frames(t, 3)
+    assert keys[0] == 0
+    assert keys[-1] == len(t) - 1
+    assert len(keys) <= most
+    assert np.diff(keys).max() <= max(3, 0.5 * fps)
+    assert max(gaps) * np.median(np.diff(keys)) / fps >= 1.0
+
+
+def test_pairs_of_tracks():
+    frame, track = np.array([0, 1, 2, 3, 1, 2, 5]), np.array([0, 0, 0, 0, 1, 1, 1])
+    tracks = Tracks(frame, track, np.column_stack([frame, track]).astype(float))
+    which, first, second = tracks.pairs((1, 2), np.array([0, 1, 3, 5]))
+    assert sorted(map(tuple, which)) == [(0, 1), (0, 2), (1, 2), (1, 3)]
+    np.testing.assert_array_equal(first[:, 1], second[:, 1])
+    np.testing.assert_array_equal(np.array([0, 1, 3, 5])[which[:, 1]], second[:, 0])
+    assert [list(rows) for rows in tracks.rows_by_frame(6)] == [[0], [1, 4], [2, 5], [3], [], [6]]
+
+
+def test_background_that_is_nearly_all_masked_is_said():
+    frames = turned_views(300.0, pan(16, 10.0))
+    masks = np.ones(frames.shape[:3], bool)
+    masks[:, :, :6] = False
+    path = estimate_camera(frames, masks, np.arange(16) / 24, settings(300.0), Silent())
+    assert path.report["mode"] == "static"
+    assert "corners" in path.report["fallback"]
+    assert path.report["gravity_std_deg"] > 5
+    assert np.isfinite(path.T_world_cam).all()
+
+
+def test_featureless_background_is_said():
+    frames = np.full((12, 120, 160, 3), 128, np.uint8)
+    path = estimate_camera(frames, np.zeros(frames.shape[:3], bool), np.arange(12) / 24, settings(200.0), Silent())
+    assert "corners" in path.report["fallback"]
+    assert path.report["reprojection_error_px"] is None
+
+
+def test_folders_of_killed_processes_are_removed(tmp_path, monkeypatch):
+    monkeypatch.setattr(sfm.tempfile, "gettempdir", lambda: str(tmp_path))
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    for owner in (ended.pid, os.getpid(), "other"):
+        (tmp_path / f"slomo-sfm-{owner}-x").mkdir()
+    sfm._remove_orphans()
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([f"slomo-sfm-{os.getpid()}-x", "slomo-sfm-other-x"])
