@@ -8,21 +8,25 @@ import torch
 
 from slomo.reconstruct import losses, silhouette, standing
 from slomo.reconstruct.kinematics import Posed
-from slomo.reconstruct.problem import Draw, Problem
+from slomo.reconstruct.problem import Draw, Problem, Variables
 from slomo.reconstruct.run import Run
+from slomo.reconstruct.trajectory import Guess
 
 Array = np.ndarray
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """names: N key points; keypoints (T, N, 3) m; confidence (T, N); contact (T, F); T_world_cam (T, 4, 4) m."""
+    """names: N key points; keypoints (T, N, 3) m; confidence (T, N); contact (T, F); T_world_cam (T, 4, 4) m; body: posed
+    at every time, in the fit's units, of which `metres_per_unit` says the length."""
 
     names: tuple[str, ...]
     keypoints: Array
     confidence: Array
     contact: Array
     T_world_cam: Array
+    body: Posed
+    metres_per_unit: float
     report: dict[str, Any]
 
 
@@ -33,16 +37,10 @@ def assess(problem: Problem, run: Run, metres: float) -> Outcome:
     every = torch.arange(len(obs.t))
     with torch.no_grad():
         shape = {k.removeprefix("shape."): v for k, v in run.x.items() if k.startswith("shape.")}
-        position, R, q = problem.path(run.x, run.guess, shape["log_length"].exp(), every)
+        body, contact, _ = stood(problem, run.x, run.guess)
         R_cam, centre = problem.cameras(run.x["tilt"], every)
         own = own_length(problem, shape)
         per_unit = metres / own
-        free = kin.pose(shape, position, R, q).nodes[0].numpy().astype(float)
-        t, feet = obs.t.numpy().astype(float), free[:, list(skeleton.contacts)]
-        contact = standing.contact_probability(feet, free[:, 0], t, own, skeleton.sole)
-        ground = skeleton.sole * float(shape["log_length"].exp()[0])
-        q = standing.stand(kin, shape, position, R, q, standing.places(feet, contact, t, ground))
-        body = kin.pose(shape, position, R, q)
         nodes = body.nodes[0].numpy().astype(float)
         iou, error, frame_iou = _overlap(problem, run)
         confidence = _confidence(problem, body, R_cam, centre, frame_iou)
@@ -68,7 +66,24 @@ def assess(problem: Problem, run: Run, metres: float) -> Outcome:
         "working_size": [obs.K.width, obs.K.height],
     }
     names = tuple(skeleton.names[m] for m in keep)
-    return Outcome(names, nodes[:, keep] * per_unit, confidence[:, keep], contact, T_world_cam, report)
+    return Outcome(names, nodes[:, keep] * per_unit, confidence[:, keep], contact, T_world_cam, body, per_unit, report)
+
+
+def stood(problem: Problem, x: Variables, guess: Guess) -> tuple[Posed, Array, torch.Tensor]:
+    """The body of one hypothesis at every frame with its feet held where they stand, the probability (T, F) that each
+    stands, and its joint angles (1, T, B, 3)."""
+    kin = problem.kin
+    skeleton = kin.skeleton
+    with torch.no_grad():
+        shape = {k.removeprefix("shape."): v.detach() for k, v in x.items() if k.startswith("shape.")}
+        length = shape["log_length"].exp()
+        position, R, q = problem.path(x, guess, length, torch.arange(len(problem.obs.t)))
+        free = kin.pose(shape, position, R, q).nodes[0].numpy().astype(float)
+        t, feet = problem.obs.t.numpy().astype(float), free[:, list(skeleton.contacts)]
+        contact = standing.contact_probability(feet, free[:, 0], t, own_length(problem, shape), skeleton.sole)
+        ground = skeleton.sole * float(length[0])
+        q = standing.stand(kin, shape, position, R, q, standing.places(feet, contact, t, ground))
+        return kin.pose(shape, position, R, q), contact, q
 
 
 def _margin(log: dict) -> float | None:

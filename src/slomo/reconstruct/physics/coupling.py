@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from slomo.reconstruct.losses import State, Term
-from slomo.reconstruct.outcome import own_length
+from slomo.reconstruct.outcome import own_length, stood
 from slomo.reconstruct.physics.learn import FOOT_WEIGHT, Learner, PhysicsConfig, Simulated, Variables
 from slomo.reconstruct.physics.model import Body, Mechanics, build
 from slomo.reconstruct.physics.windows import Kinematic
@@ -48,46 +48,43 @@ class Physics:
         self._variables = {k: torch.from_numpy(v) for k, v in part("learned.").items()} or None
         self._base = Kinematic(**part("base.")) if arrays else None
 
-    def round(self, x: FitVariables, guess: Guess, iterations: int | None = None) -> tuple[Simulated, float]:
+    def round(self, x: FitVariables, guess: Guess) -> tuple[Simulated, float]:
         """Learn to follow the motion of one hypothesis, and simulate it.
-
-        Args:
-            iterations: of Adam; default the config's for a first round, a third of them for later ones.
 
         Returns:
             The simulated motion in metres, and metres per world unit of the fit.
         """
         body, kinematic, unit = self.body(x, guess)
         mirror = self.problem.kin.skeleton.mirror[: len(body.parent)]
-        c, first = self.config, self._variables is None
-        if first:
+        c, later = self.config, int(self._variables is not None)
+        if not later:
             self._base = kinematic
         learner = Learner(body, kinematic, mirror, c, base=self._base)
-        n = iterations or (c.iterations if first else max(1, c.iterations // 3))
         high, low = c.assistance
-        falling = high * (low / high) ** np.clip(np.arange(n) / max(n * 2 / 3, 1), 0, 1)
+        n = c.iterations[later]
+        falling = high * (low / high) ** np.clip(2 * np.arange(n) / n, 0, 1)
         start = learner.start() if self._variables is None else self._variables
-        self._variables, losses = learner.learn(start, n, falling if first else np.full(n, low))
+        self._variables, losses = learner.learn(start, np.full(n, low) if later else falling, rate=c.rate[later])
         simulated = learner.simulate(self._variables, low)
-        simulated.report["loss"] = [round(losses[0], 3), round(losses[-1], 3)]
+        simulated.report["loss"] = [round(losses[0], 3), round(min(losses), 3)]
         return simulated, unit
 
     def body(self, x: FitVariables, guess: Guess) -> tuple[Body, Kinematic, float]:
         """The mechanical body of the fitted shape, the fitted motion at every frame, and metres per world unit."""
         problem, skeleton = self.problem, self.problem.kin.skeleton
         shape = {k.removeprefix("shape."): v.detach() for k, v in x.items() if k.startswith("shape.")}
-        with torch.no_grad():
-            length = shape["log_length"].exp()
-            position, R, q = problem.path(x, guess, length, torch.arange(len(problem.obs.t)))
-            posed = problem.kin.pose(shape, position, R, q)
-            offset = problem.kin.offsets(shape)
+        length = shape["log_length"].exp()
+        offset = problem.kin.offsets(shape)
+        # With the feet held where they stand: feet that slide cannot be followed.
+        posed, _, q = stood(problem, x, guess)
         unit = self.metres / own_length(problem, shape)
         f = lambda v: v[0].numpy().astype(float)  # noqa: E731
         body = build(
             skeleton, f(offset) * unit, f(posed.radii) * unit, length=float(length[0]) * unit, mechanics=self.mechanics
         )
         t = problem.obs.t.numpy().astype(float)
-        return body, Kinematic(t, f(position) * unit, f(R), f(q), f(posed.nodes) * unit), unit
+        kinematic = Kinematic(t, f(posed.nodes)[:, 0] * unit, f(posed.R)[:, 0], f(q), f(posed.nodes) * unit)
+        return body, kinematic, unit
 
 
 def term(simulated: Simulated, unit: float, problem: Problem) -> Term:

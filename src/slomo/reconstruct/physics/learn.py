@@ -25,17 +25,18 @@ class PhysicsConfig:
 
     Attributes:
         window, overlap: s. dt: s of a step at most. knot: s between the knots of the controllers' corrections.
-        iterations: of Adam in a round. rate: of Adam, in units of the variables' spread.
+        iterations: of Adam in the first round and in each later one. rate: of Adam likewise, in units of the variables'
+            spread.
         assistance: share of the pull on the root at the first iteration, and the one at the end. It falls
-            geometrically over the first two thirds of the iterations of a first round.
+            geometrically over the first half of the first round.
     """
 
     window: float = 1.2
     overlap: float = 0.3
     dt: float = 0.0025
     knot: float = 0.1
-    iterations: int = 60
-    rate: float = 0.1
+    iterations: tuple[int, int] = (120, 30)
+    rate: tuple[float, float] = (0.1, 0.02)
     assistance: tuple[float, float] = (0.3, 0.003)
 
 
@@ -66,8 +67,8 @@ class Simulated:
 class Learner:
     """Follows one kinematic trajectory with one body.
 
-    What is learned are corrections to a trajectory `base`, the kinematic one of the first round: when the trajectory that
-    is followed changes between rounds, the simulated one, which is unstable, does not.
+    What is learned are corrections to a trajectory `base`, the kinematic one of the first round: when the trajectory
+    that is followed changes between rounds, the simulated one, which is unstable, does not.
 
     Args:
         mirror: (B,) link on the other side. base: default `kinematic`.
@@ -137,23 +138,34 @@ class Learner:
         own = own + 0.01 * sum(x[n].square().sum(-1) for n in ("position", "turn", "velocity", "spin"))
         return own + 0.01 * sum(x[n].square().mean() for n in SHARED)
 
-    def learn(self, x: Variables, iterations: int, assistance: Array) -> tuple[Variables, list[float]]:
-        """`iterations` of Adam from x, with the assistance of each; the result and the loss of each."""
+    def learn(self, x: Variables, assistance: Array, *, rate: float) -> tuple[Variables, list[float]]:
+        """One iteration of Adam from x for each entry of `assistance`.
+
+        Returns:
+            The best variables met with the last assistance, and the mean loss of the windows before each iteration and
+            at the end.
+        """
         x = {k: v.detach().clone().requires_grad_() for k, v in x.items()}
-        optimiser = torch.optim.Adam(x.values(), lr=self.config.rate, betas=(0.9, 0.95))
-        losses = []
-        for i in range(iterations):
-            decay = 0.15 + 0.85 * 0.5 * (1 + np.cos(np.pi * i / iterations))
+        optimiser = torch.optim.Adam(x.values(), lr=rate, betas=(0.9, 0.95))
+        losses, best, kept = [], np.inf, x
+        n = len(assistance)
+        for i in range(n + 1):
+            with torch.set_grad_enabled(i < n):
+                share = float(assistance[min(i, n - 1)])
+                loss = self.distance(self.roll(self.controls(x, share))) + self.effort(x)
+            losses.append(float(loss.detach().nan_to_num(100.0).mean()))
+            if share == assistance[-1] and losses[-1] < best:
+                best, kept = losses[-1], {k: v.detach().clone() for k, v in x.items()}
+            if i == n:
+                break
             for group in optimiser.param_groups:
-                group["lr"] = self.config.rate * decay
-            loss = self.distance(self.roll(self.controls(x, float(assistance[i])))) + self.effort(x)
+                group["lr"] = rate * (0.15 + 0.425 * (1 + np.cos(np.pi * i / n)))
             optimiser.zero_grad()
             # A window whose simulation broke must not spoil what all share.
             torch.where(torch.isfinite(loss), loss, 0.0).sum().backward()
             _tame(x)
             optimiser.step()
-            losses.append(float(loss.detach().nan_to_num(100.0).mean()))
-        return {k: v.detach() for k, v in x.items()}, losses
+        return kept, losses
 
     def simulate(self, x: Variables, assistance: float) -> Simulated:
         """The roll-out as it is, its windows blended."""
