@@ -1,17 +1,26 @@
 """The reconstruction as a stage: the coarse fit in, refined; metric key points and a report out."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from slomo.mesh import SkinnedMesh
+from slomo.reconstruct.body_colours import coloured_by_clip
+from slomo.reconstruct.body_mesh import body_mesh, field_mesh
+from slomo.reconstruct.descent import Plan, descend
+from slomo.reconstruct.fields.background import colours
+from slomo.reconstruct.fields.config import FieldsConfig
+from slomo.reconstruct.fields.mesh import mesh
 from slomo.reconstruct.fit_stage import FitConfig, Prepared, one_thread, prepare
+from slomo.reconstruct.observations import unpack
 from slomo.reconstruct.outcome import Outcome, assess
-from slomo.reconstruct.run import from_arrays
+from slomo.reconstruct.physics.learn import PhysicsConfig
+from slomo.reconstruct.run import Run, from_arrays
 from slomo.stage import Artifact, Inputs, Progress
 
-REFINE_VERSION = 2
+REFINE_VERSION = 3
 
 # The rest pose at the right place overlaps by 0.5 to 0.6, a fit that is right by 0.75 and more. Below this the body is
 # elsewhere or another shape in many frames, and its key points do not follow the subject.
@@ -20,7 +29,39 @@ MIN_IOU = 0.45
 
 @dataclass(frozen=True)
 class ReconstructConfig(FitConfig):
-    """Parameters of the reconstruction: those of the fit, and of its refinement."""
+    """Parameters of the reconstruction: those of the fit, and of its refinement.
+
+    Attributes:
+        fields: whether the neural model of the body is fitted. physics: whether the motion is drawn towards a simulated
+            one. Draft quality has neither.
+        weight_colour, weight_opacity, weight_field_flow, weight_eikonal, weight_cycle, weight_background,
+            weight_residual: of the terms of the fields. weight_physics: of the pull towards the simulated motion.
+    """
+
+    fields: bool = True
+    physics: bool = True
+    weight_colour: float = 0.3
+    weight_opacity: float = 0.3
+    weight_field_flow: float = 0.3
+    weight_eikonal: float = 0.05
+    weight_cycle: float = 0.01
+    weight_background: float = 0.3
+    weight_residual: float = 0.02
+    weight_physics: float = 0.5
+
+    def plan(self) -> Plan:
+        """What the refinement does at this quality."""
+        done = PLANS[self.quality]
+        return replace(
+            done, fields=done.fields if self.fields else None, physics=done.physics if self.physics else None
+        )
+
+
+PLANS = {
+    "draft": Plan(None, None),
+    "normal": Plan(FieldsConfig(), PhysicsConfig(), appearance=100, joint=300, rounds=2, render=60),
+    "high": Plan(FieldsConfig(), PhysicsConfig(), appearance=200, joint=900, rounds=4, render=100),
+}
 
 
 def run_refine(inputs: Inputs, config: ReconstructConfig, progress: Progress) -> Artifact:
@@ -32,8 +73,13 @@ def run_refine(inputs: Inputs, config: ReconstructConfig, progress: Progress) ->
     began, cpu = time.perf_counter(), time.process_time()
     made = prepare(inputs, config)
     run = from_arrays(inputs.artifacts["fit"].npz["fit.npz"])
+    plan = config.plan()
+    frames = np.asarray(inputs.artifacts["decode"].npz["frames.npz"]["frames"])
     with one_thread():
+        images = colours(frames, made.problem.obs) if plan.fields else None
+        run = descend(made.problem, run, images, plan, metres=made.metres, seed=config.seed, progress=progress)
         outcome = assess(made.problem, run, made.metres)
+        body = _mesh(made, run, outcome, plan.fields, frames)
     source = "length_m" if config.length_m else f"typical length of {made.skeleton.name}"
     progress.note(f"size: {made.metres:g} m from {source}; the video alone does not tell it")
     report: dict[str, Any] = outcome.report | {
@@ -45,7 +91,20 @@ def run_refine(inputs: Inputs, config: ReconstructConfig, progress: Progress) ->
     failure = None
     if iou < MIN_IOU:
         failure = f"the fitted body covers the subject badly (IoU {iou:.2f}, needs {MIN_IOU}); look at the masks"
-    return Artifact(npz={"keypoints.npz": _arrays(made, outcome)}, json={"report.json": report}, failure=failure)
+    npz = {"keypoints.npz": _arrays(made, outcome), "mesh.npz": body.to_arrays()}
+    return Artifact(npz=npz, json={"report.json": report}, failure=failure)
+
+
+def _mesh(made: Prepared, run: Run, outcome: Outcome, fields: FieldsConfig | None, frames: np.ndarray) -> SkinnedMesh:
+    """The surface of the field, or, where there is none, the skin of the capsules in the colours of the clip."""
+    kin, t = made.problem.kin, made.problem.obs.t.numpy().astype(float)
+    shape = {k.removeprefix("shape."): v for k, v in run.x.items() if k.startswith("shape.")}
+    unit = outcome.metres_per_unit
+    if fields:
+        return field_mesh(mesh(run.x, fields, kin, shape), kin, shape, outcome.body, t, metres_per_unit=unit)
+    skin = body_mesh(kin, shape, outcome.body, t, metres_per_unit=unit)
+    masks = unpack(made.masks["packed"], made.masks["shape"])
+    return coloured_by_clip(skin, lambda k: frames[k], lambda k: masks[k], np.asarray(made.K), outcome.T_world_cam)
 
 
 def _arrays(made: Prepared, o: Outcome) -> dict[str, np.ndarray]:
