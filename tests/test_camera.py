@@ -149,6 +149,22 @@ def test_gravity_without_lines_is_the_prior_and_says_so():
     assert g.roll == pytest.approx(0.0, abs=1e-9)
 
 
+def test_gravity_without_lines_knows_that_the_subject_stands_on_the_ground():
+    """Feet high in the picture of a camera that, by the prior alone, would have its horizon below them."""
+    image, masks = np.full((1, 240, 320, 3), 128, np.uint8), np.zeros((1, 240, 320), bool)
+    masks[0, 20:60, 140:180] = True
+    focal = 250.0
+    high = gravity_from_lines(image, masks, np.eye(3)[None], focal, CENTER)
+    feet = np.array([0.0, (59 - CENTER[1]) / focal, 1.0])
+    assert feet @ high.up < 0
+    assert high.pitch > gravity_from_lines(image, masks[:, ::-1], np.eye(3)[None], focal, CENTER).pitch
+    # A mask that the picture's border cuts off shows no feet.
+    cut = np.zeros_like(masks)
+    cut[0, 20:, 140:180] = True
+    none = gravity_from_lines(image, np.zeros_like(masks), np.eye(3)[None], focal, CENTER)
+    assert gravity_from_lines(image, cut, np.eye(3)[None], focal, CENTER).pitch == none.pitch
+
+
 def test_poses_between_are_on_the_way():
     T = np.tile(np.eye(4), (2, 1, 1))
     T[1, :3, 3] = [1, 2, 3]

@@ -99,6 +99,9 @@ class Gravity:
 # Hand-held footage of an animal looks down on it: prior of pitch and roll (rad), mean and standard deviation.
 PITCH_PRIOR, PITCH_STD = np.radians(12.0), np.radians(8.0)
 ROLL_STD = np.radians(2.5)
+# The camera's height in heights of the subject: a cat seen standing up is 5, a horse or a person under 1; mean and
+# standard deviation of the logarithm.
+LOG_HEIGHT, LOG_HEIGHT_STD = np.log(1.3), 0.8
 
 
 def up_vector(pitch: float, roll: float) -> np.ndarray:
@@ -110,10 +113,11 @@ def up_vector(pitch: float, roll: float) -> np.ndarray:
 def gravity_from_lines(
     frames: np.ndarray, masks: np.ndarray, R_world_cam: np.ndarray, focal: float, center: np.ndarray
 ) -> Gravity:
-    """Most probable pitch and roll given line segments that may be vertical, and the prior.
+    """Most probable pitch and roll given line segments that may be vertical, where the subject stands, and the prior.
 
     Every image of a vertical line spans, with the camera's centre, a plane that contains up: normal . up = 0. The
-    segments' angular errors are taken as a mixture of a Gaussian (0.6 degrees) and clutter, maximised over a grid.
+    segments' angular errors are taken as a mixture of a Gaussian (0.6 degrees) and clutter, maximised over a grid. The
+    subject's feet are on the ground, so they are below the horizon, and by how much of its height is part of the prior.
 
     Args:
         frames: (N, H, W, 3) uint8 RGB, a few of them.  masks: (N, H, W) bool.  R_world_cam: (N, 3, 3); the world is
@@ -131,6 +135,7 @@ def gravity_from_lines(
     grid = np.stack([-np.cos(pitch) * np.sin(roll), -np.cos(pitch) * np.cos(roll), -np.sin(pitch)], -1)
     sigma, clutter = np.radians(0.6), 0.03
     log = -0.5 * ((pitch - PITCH_PRIOR) / PITCH_STD) ** 2 - 0.5 * (roll / ROLL_STD) ** 2
+    log = log + _subject_log_likelihood(grid, masks, R_world_cam, focal, center)
     if len(normals):
         error = np.arcsin(np.clip(grid @ normals.T, -1, 1)) / sigma
         # A segment counts by its length in tenths of the picture's height; fifty of them say no more than ten do.
@@ -151,6 +156,30 @@ def gravity_from_lines(
         roll_std=float(np.sqrt((p * (roll - mean[1]) ** 2).sum())),
         lines=agree,
     )
+
+
+def _subject_log_likelihood(
+    up: np.ndarray, masks: np.ndarray, R_world_cam: np.ndarray, focal: float, center: np.ndarray
+) -> np.ndarray:
+    """(...) for up (..., 3): how likely the camera's height is, seen against the subject's, by the median frame."""
+    logs = []
+    for mask, R in zip(masks, R_world_cam, strict=True):
+        rows, columns = np.nonzero(mask)
+        if len(rows) < 50:
+            continue
+        top, bottom = np.quantile(rows, [0.0, 1.0])
+        if bottom >= len(mask) - 2:
+            continue  # the feet are cut off
+        u = np.median(columns[rows >= bottom - 0.05 * (bottom - top)])
+        foot, head = (R @ [(u - center[0]) / focal, (v - center[1]) / focal, 1.0] for v in (bottom, top))
+        down, rise = -(up @ foot), up @ head
+        # The head is as far away along the ground as the foot, which is 1 below the camera.
+        away = [np.sqrt(np.maximum(ray @ ray - (up @ ray) ** 2, 1e-9)) for ray in (foot, head)]
+        size = 1.0 + rise * away[0] / away[1] / np.maximum(down, 1e-3)
+        logs.append(np.where(down > 1e-3, -np.log(np.maximum(size, 1e-3)), -10.0))
+    if not logs:
+        return np.zeros(up.shape[:-1])
+    return -0.5 * ((np.median(logs, axis=0) - LOG_HEIGHT) / LOG_HEIGHT_STD) ** 2
 
 
 def _upright_segments(frame: np.ndarray, mask: np.ndarray, focal: float, center: np.ndarray):
