@@ -133,3 +133,29 @@ def test_folders_of_killed_processes_are_removed(tmp_path, monkeypatch):
         (tmp_path / f"slomo-sfm-{owner}-x").mkdir()
     sfm._remove_orphans()
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted([f"slomo-sfm-{os.getpid()}-x", "slomo-sfm-other-x"])
+
+
+class Stop(Exception):
+    pass
+
+
+def test_waiting_ends_the_process_and_its_errors_are_kept(tmp_path):
+    def stop(seconds: float) -> None:
+        if seconds > 0.2:
+            raise Stop
+
+    marker = tmp_path / "ended"
+    code = f"import time, pathlib; time.sleep(20); pathlib.Path({str(marker)!r}).touch()"
+    with pytest.raises(Stop):
+        sfm._run([sys.executable, "-c", code], tmp_path / "errors.txt", stop)
+    assert not marker.exists()
+    assert sfm._run([sys.executable, "-c", "raise SystemExit('no good')"], tmp_path / "errors.txt", print) == 1
+    assert "no good" in (tmp_path / "errors.txt").read_text()
+
+
+def test_structure_as_arrays_and_back():
+    s = structure(0.1)
+    back = sfm.Structure.of(s.arrays())
+    assert isinstance(back.focal, float)
+    for name, x in s.arrays().items():
+        np.testing.assert_array_equal(x, back.arrays()[name])

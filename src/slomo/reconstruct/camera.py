@@ -6,6 +6,7 @@
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -68,8 +69,7 @@ def estimate_camera(
     report |= {"parallax_px": parallax, "parallax_limit_px": limit}
     progress.update(0.2, f"residual of a turning camera {parallax:.2f} px")
     if parallax > limit:
-        structure = _structure(frames, masks, t, settings, report)
-        progress.update(0.8, "structure from motion")
+        structure = _structure(frames, masks, t, settings, report, progress)
         if structure is not None:
             progress.note(
                 f"camera: moving (structure from motion, {len(structure.frames)} of {report['key_frames']} key frames, "
@@ -112,9 +112,13 @@ def _key_frames(t: np.ndarray, every: int, most: int = _MOST_KEYS) -> tuple[np.n
     return np.array(sorted({*range(0, len(t), every), len(t) - 1})), gaps
 
 
-def _structure(frames, masks, t, s: CameraSettings, report: dict[str, Any]) -> sfm.Structure | None:
+def _structure(frames, masks, t, s: CameraSettings, report: dict[str, Any], progress) -> sfm.Structure | None:
     """Structure from motion of the key frames, once more with twice as many of them where they were thinned; None when
-    too few are placed. The report says how many."""
+    too few are placed. The report says how many. A structure is kept in a checkpoint."""
+    if (saved := progress.load()) is not None:
+        structure = sfm.Structure.of(saved)
+        report |= {"key_frames": int(saved["key_frames"]), "key_frames_registered": len(structure.frames)}
+        return structure
     tried = 0
     for most in (_MOST_KEYS, 2 * _MOST_KEYS):
         keys, _ = _key_frames(t, s.key_every, most)
@@ -130,12 +134,19 @@ def _structure(frames, masks, t, s: CameraSettings, report: dict[str, Any]) -> s
             features=s.features,
             overlap=s.overlap,
             seed=s.seed,
+            waiting=partial(_waiting, progress, 1.5 * tried),
         )
         registered = 0 if structure is None else len(structure.frames)
         report |= {"key_frames": len(keys), "key_frames_registered": registered}
         if structure is not None and registered >= sfm.ENOUGH * len(keys):
+            progress.save(structure.arrays() | {"key_frames": np.array(len(keys))})
             return structure
     return None
+
+
+def _waiting(progress, usual: float, took: float) -> None:
+    """The share of structure from motion's work that is done can only be guessed, from the s that it takes usually."""
+    progress.update(0.2 + 0.6 * took / (took + usual), "structure from motion")
 
 
 def _background_motion(tracks: Tracks) -> float:

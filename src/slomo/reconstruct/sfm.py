@@ -4,6 +4,7 @@ The process keeps pycolmap and OpenCV, which do not load together, apart: this m
 the work is handed over, and `python -m slomo.reconstruct.sfm DIR` is what runs it.
 """
 
+import contextlib
 import json
 import os
 import shutil
@@ -12,7 +13,8 @@ import sys
 import tempfile
 import threading
 import time
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +56,17 @@ class Structure:
     error_px: float
     least_angle: float
 
+    @classmethod
+    def of(cls, arrays: Mapping[str, np.ndarray]) -> "Structure":
+        """From the arrays of the same names; numbers are arrays without axes."""
+        values = {f.name: np.asarray(arrays[f.name]) for f in fields(cls)}
+        plain: dict[str, Any] = {k: v if v.ndim else float(v) for k, v in values.items()}
+        return cls(**plain)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What `of` makes it from."""
+        return {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
+
 
 def reconstruct_structure(
     frames: np.ndarray,
@@ -66,6 +79,7 @@ def reconstruct_structure(
     overlap: int,
     seed: int = 0,
     threads: int = 1,
+    waiting: Callable[[float], None] = lambda seconds: None,
 ) -> Structure | None:
     """Cameras of the frames `keys` and sparse points of what is not masked; None when COLMAP finds no model.
 
@@ -73,6 +87,7 @@ def reconstruct_structure(
         frames: (T, H, W, 3) uint8 RGB.  masks: (T, H, W) bool, left out.
         focal: px, start, kept when not `refine_focal`.  features: per frame.  overlap: frames matched with each.
         threads: of COLMAP; with more than one, each run gives slightly other numbers.
+        waiting: called twice a second with the seconds that it has taken; what it raises ends the process.
 
     Raises:
         StageFailed: the process died.
@@ -100,17 +115,30 @@ def reconstruct_structure(
             "threads": threads,
         }
         (root / "job.json").write_text(json.dumps(job))
-        done = subprocess.run(
-            [sys.executable, "-m", "slomo.reconstruct.sfm", folder], capture_output=True, text=True, check=False
-        )
-        if done.returncode:
-            last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-            raise StageFailed(f"structure from motion ended with status {done.returncode}: {last}", where="camera")
+        status = _run([sys.executable, "-m", "slomo.reconstruct.sfm", folder], root / "errors.txt", waiting)
+        if status:
+            last = ((root / "errors.txt").read_text().strip().splitlines() or ["no message"])[-1]
+            raise StageFailed(f"structure from motion ended with status {status}: {last}", where="camera")
         if not (root / "out.npz").exists():
             return None
         with np.load(root / "out.npz") as z:
-            arrays: dict[str, Any] = {k: z[k] if z[k].ndim else float(z[k]) for k in z.files}
-        return Structure(**arrays)
+            return Structure.of({k: z[k] for k in z.files})
+
+
+def _run(command: list[str], errors: Path, waiting: Callable[[float], None]) -> int:
+    """Exit status of a process. The terminal's signals end it too: `waiting` is asked once more after its end."""
+    began = time.monotonic()
+    with open(errors, "wb") as f:
+        process = subprocess.Popen(command, stdout=f, stderr=f)
+    try:
+        while process.poll() is None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(0.5)
+            waiting(time.monotonic() - began)
+        return process.returncode
+    finally:
+        process.kill()
+        process.wait()
 
 
 def _remove_orphans() -> None:
