@@ -78,12 +78,20 @@ def _walk() -> tuple[np.ndarray, dict, dict]:
     return pw, masks, dict(flow=flow.astype(np.float16), consistent=np.packbits(np.ones_like(mask[1:]), axis=-1))
 
 
+def _frames(masks: dict) -> np.ndarray:
+    """A dark body in front of noise."""
+    inside = np.unpackbits(masks["packed"], axis=-1)[..., : masks["shape"][2]].astype(bool)
+    frames = np.random.default_rng(0).integers(100, 255, (*inside.shape, 3)).astype(np.uint8)
+    frames[inside] //= 3
+    return frames
+
+
 def _inputs(masks: dict, flow: dict) -> Inputs:
     intrinsics = np.array([[K.fx, 0, K.cx], [0, K.fy, K.cy], [0, 0, 1]])
     camera = dict(K=intrinsics, T_world_cam=np.tile(_camera(), (T, 1, 1)))
     return Inputs(
         artifacts={
-            "decode": Artifact(npz={"frames.npz": dict(t=np.arange(T) / FPS)}),
+            "decode": Artifact(npz={"frames.npz": dict(t=np.arange(T) / FPS, frames=_frames(masks))}),
             "masks": Artifact(npz={"masks.npz": masks, "flow.npz": flow}),
             "camera": Artifact(npz={"camera.npz": camera}, json={"report.json": dict(mode="moving")}),
         }

@@ -17,7 +17,7 @@ from slomo.reconstruct.fit import rank
 from slomo.reconstruct.physics import coupling
 from slomo.reconstruct.physics.coupling import Physics
 from slomo.reconstruct.physics.learn import PhysicsConfig
-from slomo.reconstruct.problem import Problem, Schedule, optimise
+from slomo.reconstruct.problem import Problem, Schedule, Variables, optimise
 from slomo.reconstruct.run import Run, checkpoint, restore
 from slomo.stage import Progress
 
@@ -25,7 +25,7 @@ Tensor = torch.Tensor
 
 POSE = ("Q", "G", "shape", "tilt")
 FIELDS = "F."
-PHYSICS = "physics."  # prefix of its state in a checkpoint
+PHYSICS, NOW = "physics.", "now."  # prefixes in a checkpoint: the physics' state; variables within a step
 WORSE = 0.02  # a step is undone when the loss of the coarse fit's own terms rises by more than this share
 
 
@@ -71,8 +71,10 @@ def descend(
     resumed, start, adam_state = restore(saved, generator)
     fields = Fields(plan.fields, problem.obs, problem.kin, images) if plan.fields and images is not None else None
     physics = Physics(problem, metres, plan.physics) if plan.physics else None
+    now: Variables = {}
     if resumed is not None and saved is not None:
         run = resumed
+        now = {k.removeprefix(NOW): torch.from_numpy(np.array(v)) for k, v in saved.items() if k.startswith(NOW)}
         if physics:
             physics.restore({k.removeprefix(PHYSICS): v for k, v in saved.items() if k.startswith(PHYSICS)})
     else:
@@ -87,18 +89,18 @@ def descend(
         posed, schedule, about = _step(name, problem, run, fields, physics, plan)
         entry |= about
 
-        def each(i: int, optimiser: torch.optim.Adam, loss: Tensor, run=run, schedule=schedule, held=held) -> None:
+        x = now or {k: v.clone() for k, v in run.x.items()}
+
+        def each(i: int, optimiser: torch.optim.Adam, loss: Tensor, run=run, schedule=schedule, held=held, x=x) -> None:
             done = (run.phase + i / schedule.iterations) / len(steps)
             progress.update(done, f"{steps[run.phase]} {i}/{schedule.iterations}, loss {float(loss.min()):.3f}")
             if progress.checkpoint_due():
                 state = checkpoint(run, i, optimiser, generator)
+                state |= {f"{NOW}{k}": v.detach().numpy().copy() for k, v in x.items()}
                 progress.save(state | {f"{PHYSICS}{k}": v for k, v in held.items()})
 
-        x = optimise(
-            posed, {k: v.clone() for k, v in run.x.items()}, run.guess, schedule, generator,
-            start=start, adam_state=adam_state, each=each,
-        )  # fmt: skip
-        start, adam_state = 0, None
+        x = optimise(posed, x, run.guess, schedule, generator, start=start, adam_state=adam_state, each=each)
+        start, adam_state, now = 0, None, {}
         after = float(rank(problem, x, run.guess)[0])
         kept = bool(np.isfinite(after) and after <= (1 + WORSE) * before)
         entry |= {"loss_after": round(after, 4), "kept": kept}
