@@ -6,7 +6,7 @@ distance of Wang, Shen and Porikli, CVPR 2015). A static post has the ground's m
 the post at little cost however large its parallax is at the top; a body that moves is closed off all around.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import dijkstra
 from slomo.reconstruct.background import Overlay
 from slomo.reconstruct.colour import ColourModel, cut, learn_colours, to_lab
 from slomo.reconstruct.flow import Flow
+from slomo.reconstruct.instances import Choice, follow
 from slomo.reconstruct.segment import Masks, Report, blend_over_time, component_at, grown, no_subject
 from slomo.reconstruct.tracks import background_tracks
 
@@ -28,12 +29,14 @@ class MotionSegmenter:
     """Motion, then colour.
 
     Attributes:
+        choice: whom the user means.
         every: motion and colour are looked at in every n-th frame; flow fills the frames between.
         gap: frames over which motion is taken, either way.
         least_motion: px (at 256), score that the subject must reach in some frames.
         rounds: times that the colours are learned again from the silhouettes.
     """
 
+    choice: Choice = field(default_factory=Choice)
     every: int = 2
     gap: int = 4
     least_motion: float = 1.5
@@ -64,7 +67,7 @@ class MotionSegmenter:
         whole = lambda small: cv2.resize(small, (W, H), interpolation=cv2.INTER_LINEAR)  # noqa: E731
         # At first whatever may be the subject is kept out of the background, later what is thought to be.
         covered = {k: moving[k] > 0.3 for k in keys}
-        body = {k: component_at(whole(moving[k]) > 0.5) for k in keys}
+        body = follow({k: whole(moving[k]) > 0.5 for k in keys}, flow, self.choice)
         for turn in range(self.rounds):
             last = turn == self.rounds - 1
             differs = {}
@@ -95,8 +98,8 @@ def shrink_flow(flow: Flow, size: tuple[int, int]) -> Flow:
     def smaller(fields: np.ndarray) -> np.ndarray:
         shape = (len(fields), size[1], size[0], 2)
         out = np.empty(shape, np.float16)
-        for t, field in enumerate(fields):
-            out[t] = factor * cv2.resize(field.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        for t, whole in enumerate(fields):
+            out[t] = factor * cv2.resize(whole.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         return out
 
     consistent = [cv2.resize(c.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) for c in flow.consistent]

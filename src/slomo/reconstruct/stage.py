@@ -119,13 +119,16 @@ def run_masks(inputs: Inputs, config: MasksConfig, progress: Progress) -> Artifa
 
     Raises:
         InvalidData: no subject is found, the user's masks do not fit, or the weights cannot be loaded.
-        UsageError: unknown segmenter, or what it needs was not given.
+        UsageError: unknown segmenter, what it needs was not given, or a subject is chosen where there can be none.
     """
     from slomo.reconstruct.flow import dense_flow
+    from slomo.reconstruct.instances import choose
     from slomo.reconstruct.segment import frame_quality
 
-    segmenter = _segmenter(inputs, config)
-    frames = inputs.artifacts["decode"].npz["frames.npz"]["frames"]
+    decoded = inputs.artifacts["decode"]
+    frames = decoded.npz["frames.npz"]["frames"]
+    choice = choose(config.subject_at, config.subject_box, decoded.json.get("video.json", {}), len(frames))
+    segmenter = _segmenter(inputs, config, choice)
     progress.note(f"masks: segmenter {segmenter.name}")
     flow = dense_flow(frames, lambda f: progress.update(0.25 * f, "optical flow"))
     found = segmenter.segment(frames, flow, lambda f: progress.update(0.25 + 0.7 * f, f"masks ({segmenter.name})"))
@@ -199,7 +202,7 @@ def unpack(arrays) -> np.ndarray:
     return np.unpackbits(arrays["packed"], axis=-1)[..., : int(arrays["shape"][2])].astype(bool)
 
 
-def _segmenter(inputs: Inputs, config: MasksConfig):
+def _segmenter(inputs: Inputs, config: MasksConfig, choice):
     """The segmenter that the configuration and the files at hand decide on."""
     name = config.segmenter
     if name not in SEGMENTERS:
@@ -211,6 +214,8 @@ def _segmenter(inputs: Inputs, config: MasksConfig):
 
         if "masks" not in inputs.files:
             raise UsageError("no masks were given", where="masks.segmenter", todo="add --masks DIR")
+        if choice.how != "largest":
+            raise UsageError("your own masks say who the subject is", where="--subject-at, --subject-box")
         return UserMasks(inputs.files["masks"])
     if name == "u2netp":
         from slomo.reconstruct.saliency import SaliencySegmenter
@@ -222,7 +227,7 @@ def _segmenter(inputs: Inputs, config: MasksConfig):
                 where="masks.segmenter",
                 todo=f"set {WEIGHTS_VARIABLE} to their path, or use --segmenter motion",
             )
-        return SaliencySegmenter(U2Net(inputs.files["weights"]), every=max(1, config.network_every))
+        return SaliencySegmenter(U2Net(inputs.files["weights"]), choice, every=max(1, config.network_every))
     from slomo.reconstruct.motion_segment import MotionSegmenter
 
-    return MotionSegmenter()
+    return MotionSegmenter(choice)

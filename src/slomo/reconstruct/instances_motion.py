@@ -1,0 +1,103 @@
+"""What of a picture shares the subject's motion against the background: neither a box that it walks past, nor a post in
+front of it, nor an animal that goes another way."""
+
+import cv2
+import numpy as np
+
+from slomo.reconstruct.flow import Flow, sample
+from slomo.reconstruct.motion_segment import residual_motion
+
+_SIDE = 256  # px, longer side at which motion is looked at
+_GAP = 4  # frames over which it is taken, either way
+_MOVES = 2.0  # px at that size and over that gap, from which on a body as a whole is said to move
+_FOREIGN = 0.2  # part of the body's motion, below which a patch does not share it
+_LOST = 64.0  # px, a motion that flow cannot have followed
+_ASTRAY = 1.5  # px, median motion of the whole picture, from which on the homography has not been found
+_KEPT = 64  # frames whose motion is remembered
+
+
+class SharedMotion:
+    """Motion against the homography that most of the picture follows, frame by frame."""
+
+    def __init__(self, flow: Flow):
+        self._flow = flow
+        self._factor = _SIDE / max(flow.size)
+        self._size = (round(flow.size[0] * self._factor), round(flow.size[1] * self._factor))
+        self._known: dict[int, np.ndarray] = {}
+
+    def residual(self, t: int) -> np.ndarray:
+        """(h, w, 2) float32 px at `_SIDE` over `_GAP` frames; NaN where something covers or uncovers the pixel, so that
+        the flow to neither side leads there and home again."""
+        if t not in self._known:
+            last = len(self._flow.forward)
+            ends = [u for u in (t - _GAP, t + _GAP) if 0 <= u <= last] or [last if t < last / 2 else 0]
+            fields, errors = [], []
+            for u in ends:
+                there, back = self._chain(t, u), self._chain(u, t)
+                fields.append(residual_motion(there) * (_GAP / (u - t)))
+                errors.append(np.linalg.norm(there + sample(back, there), axis=-1, keepdims=True))
+            best = fields[0] if len(ends) == 1 else np.where(errors[0] < errors[1], *fields)
+            size = np.linalg.norm(best, axis=-1, keepdims=True)
+            unsure = (np.minimum.reduce(errors) > 1.0 + 0.1 * size) | (size > _LOST)
+            if unsure.mean() > 0.6 or np.median(size[~unsure]) > _ASTRAY:
+                unsure[:] = True
+            while len(self._known) >= _KEPT:
+                self._known.pop(next(iter(self._known)))
+            self._known[t] = np.where(unsure, np.nan, best).astype(np.float16)
+        return self._known[t].astype(np.float32)
+
+    def velocity(self, t: int, mask: np.ndarray) -> np.ndarray:
+        """(2,) px at `_SIDE` over `_GAP` frames: the median motion of (H, W) bool in frame t."""
+        inside = self._inside(t, mask)
+        return np.median(inside, axis=0) if len(inside) > 10 else np.zeros(2, np.float32)
+
+    def liveliness(self, t: int, mask: np.ndarray) -> float:
+        """How fast the liveliest tenth of (H, W) bool moves in frame t, px at `_SIDE` over `_GAP` frames."""
+        inside = self._inside(t, mask)
+        return float(np.quantile(np.linalg.norm(inside, axis=-1), 0.9)) if len(inside) > 10 else 0.0
+
+    def _inside(self, t: int, mask: np.ndarray) -> np.ndarray:
+        """(n, 2) what of the residual is known and lies in (H, W) bool."""
+        small = cv2.resize(mask.astype(np.float32), self._size, interpolation=cv2.INTER_AREA) > 0.9
+        inside = self.residual(t)[np.asarray(small)]
+        return inside[np.isfinite(inside[:, 0])]
+
+    def share(self, t: int, velocity: np.ndarray) -> np.ndarray | None:
+        """(H, W): how much of the `velocity` (2,) of a body each pixel has along the same direction: 1 of a part of it,
+        0 of the background, less of what goes the other way, NaN where that cannot be seen. None of a body at rest."""
+        speed = float(np.linalg.norm(velocity))
+        if speed < _MOVES:
+            return None
+        return cv2.resize(self.residual(t) @ (velocity / speed**2), self._flow.size, interpolation=cv2.INTER_NEAREST)
+
+    def _chain(self, source: int, target: int) -> np.ndarray:
+        """(h, w, 2) px at `_SIDE` from frame `source` to `target`."""
+        total = np.zeros((self._size[1], self._size[0], 2), np.float32)
+        direction = 1 if target > source else -1
+        for t in range(source, target, direction):
+            field = self._flow.forward[t] if direction > 0 else self._flow.backward[t - 1]
+            small = cv2.resize(field.astype(np.float32), self._size, interpolation=cv2.INTER_AREA)
+            total += sample(self._factor * small, total)
+        return total
+
+
+def foreign(
+    found: np.ndarray, subject: np.ndarray, share: np.ndarray | None, *, known: np.ndarray | None = None
+) -> np.ndarray:
+    """(H, W) bool, patches of `found` that do not share the subject's motion, as `SharedMotion.share` has it.
+
+    Only what is wider than a leg: a leg that stands has the ground's motion too. And nothing most of which is `known`
+    to be the subject's: a head may turn as it likes.
+    """
+    if share is None:
+        return np.zeros_like(found)
+    calm = found & (share < _FOREIGN)
+    radius = max(2, round(0.07 * np.sqrt(max(subject.sum(), 1))))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    core = cv2.morphologyEx(calm.astype(np.uint8), cv2.MORPH_OPEN, disc)
+    patches = calm & (cv2.dilate(core, np.ones((5, 5), np.uint8)) > 0)
+    if known is not None and patches.any():
+        labels = np.asarray(cv2.connectedComponents(patches.astype(np.uint8))[1], int)
+        mostly = np.bincount(labels[known], minlength=int(labels.max()) + 1) > 0.5 * np.bincount(labels.ravel())
+        patches &= ~mostly[labels]
+    return patches

@@ -1,0 +1,224 @@
+"""Masks among several: whom the user means, who is who where animals cross, posts, leaving the frame, nobody there.
+
+The network is a stand-in that finds whatever is not the ground, so that what is tested is everything around it.
+"""
+
+import cv2
+import numpy as np
+import pytest
+
+from slomo.errors import InvalidData, UsageError
+from slomo.reconstruct.flow import dense_flow
+from slomo.reconstruct.instances import Choice, Look, choose, components, follow, tell_apart
+from slomo.reconstruct.instances_motion import SharedMotion, foreign
+from slomo.reconstruct.saliency import SaliencySegmenter
+from slomo.reconstruct.stage import MasksConfig, run_masks
+from slomo.stage import Artifact, Inputs, Silent
+
+H, W = 120, 200
+
+
+class SeesWhatIsNoGround:
+    """The ground's blue is below 100, everything else's above 150."""
+
+    digest = "0"
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        return cv2.GaussianBlur((image[..., 2] > 125).astype(np.float32), (0, 0), 0.8)
+
+    def crop(self, image: np.ndarray, box: tuple[int, int, int, int]) -> np.ndarray:
+        x0, y0, x1, y1 = box
+        out = np.zeros(image.shape[:2], np.float32)
+        out[y0:y1, x0:x1] = self(image[y0:y1, x0:x1])
+        return out
+
+
+def texture(seed: int, h: int = 200, w: int = 900) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.mean([cv2.resize(rng.uniform(0, 255, (h // s, w // s, 3)), (w, h)) for s in (3, 8)], axis=0)
+
+
+def scene(T: int, things, *, camera=lambda t: 0.0) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Frames (T, H, W, 3) with `things` (mask of (x, y) about its middle, middle x of t, tint) drawn in order over a
+    ground that the camera moves along; and the visible masks (T, H, W) of each."""
+    ground = texture(0) * [0.9, 0.9, 0.35]
+    coats = [texture(i + 1, 120, 200) for i in range(len(things))]
+    y, x = np.mgrid[:H, :W].astype(np.float32)
+    frames, masks = [], [[] for _ in things]
+    for t in range(T):
+        shift = camera(t)
+        picture = cv2.getRectSubPix(ground.astype(np.float32), (W, H), (400 + shift, 100))
+        shapes = [shape(x - (middle(t) - shift), y) for shape, middle, _ in things]
+        for i, ((_, middle, tint), mask) in enumerate(zip(things, shapes, strict=True)):
+            coat = cv2.getRectSubPix(coats[i].astype(np.float32), (W, H), (200 - (middle(t) - shift), 60))
+            picture[mask] = (0.5 * coat * tint + 0.5 * 255 * np.array(tint))[mask] * [1, 1, 0] + [0, 0, 200]
+            seen = mask & ~np.logical_or.reduce([np.zeros_like(mask), *shapes[i + 1 :]])
+            masks[i].append(seen)
+        frames.append(np.clip(picture, 0, 255).astype(np.uint8))
+    return np.array(frames), [np.array(m) for m in masks]
+
+
+def body(x, y):
+    return ((x / 30) ** 2 + ((y - 62) / 19) ** 2 < 1) | ((abs(x - 20) < 4) | (abs(x + 20) < 4)) & (abs(y - 80) < 15)
+
+
+def small_body(x, y):
+    return (x / 20) ** 2 + ((y - 52) / 13) ** 2 < 1
+
+
+def post(x, y):
+    return (abs(x) < 6) & (y < 110)
+
+
+RED, GREEN, GREY = (0.9, 0.2, 1.0), (0.2, 0.8, 1.0), (0.5, 0.45, 1.0)
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return (a & b).sum((1, 2)) / np.maximum((a | b).sum((1, 2)), 1)
+
+
+def segment(frames: np.ndarray, choice: Choice | None = None):
+    network = SeesWhatIsNoGround()
+    segmenter = SaliencySegmenter(network, choice or Choice(), every=2)  # pyright: ignore[reportArgumentType]
+    return segmenter.segment(frames, dense_flow(frames), lambda f: None)
+
+
+def test_one_crosses_behind_the_other_and_each_can_be_picked():
+    things = [(small_body, lambda t: 175 - 4.0 * t, GREEN), (body, lambda t: 70 + 1.5 * t, RED)]
+    frames, (behind, front) = scene(36, things, camera=lambda t: 0.5 * t)
+    found = segment(frames)
+    assert iou(found.masks, front).mean() > 0.9
+    assert iou(found.masks, front).min() > 0.75
+    assert found.report["chosen"] == "largest"
+    assert found.report["instances_most"] == 2
+    picked = segment(frames, Choice(0, point=(175.0, 52.0)))
+    alone = behind.sum((1, 2)) > 0.8 * behind[0].sum()
+    before = np.arange(36) < 12
+    assert iou(picked.masks, behind)[alone & before].min() > 0.8
+    assert iou(picked.masks, front).max() < 0.4  # it never hops to the other
+    assert picked.report["chosen"] == "at"
+
+
+def test_a_box_picks_and_an_empty_place_says_so():
+    things = [(small_body, lambda t: 170 + 0.5 * t, GREEN), (body, lambda t: 50 + 1.0 * t, RED)]
+    frames, (right, left) = scene(16, things)
+    assert iou(segment(frames, Choice(4, box=(145.0, 35.0, 198.0, 70.0))).masks, right).mean() > 0.85
+    assert iou(segment(frames, Choice(4, box=(15.0, 40.0, 90.0, 98.0))).masks, left).mean() > 0.85
+    with pytest.raises(InvalidData, match="--subject-at"):
+        segment(frames, Choice(4, point=(110.0, 15.0)))
+    with pytest.raises(InvalidData, match="--subject-box"):
+        segment(frames, Choice(4, box=(100.0, 2.0, 130.0, 20.0)))
+
+
+def test_a_post_in_front_leaves_one_animal():
+    things = [(body, lambda t: 60 + 2.5 * t, RED), (post, lambda t: 105.0, GREY)]
+    frames, (animal, _) = scene(36, things, camera=lambda t: 1.0 * t)
+    masks = segment(frames).masks
+    assert iou(masks, animal).mean() > 0.85
+    split = [t for t in range(36) if len(components(animal[t], 150)) == 2]
+    assert split
+    both = [all((masks[t] & c).sum() > 0.5 * c.sum() for c in components(animal[t], 150)) for t in split]
+    assert np.mean(both) > 0.7
+
+
+def test_who_leaves_the_frame_is_not_invented_and_found_again():
+    def away(t):
+        return 200 * (0.5 - 0.5 * np.cos(2 * np.pi * np.clip((t - 6) / 48, 0, 1)))
+
+    things = [(small_body, lambda t: 300.0, GREEN), (body, lambda t: 70 + 1.0 * t, RED)]
+    frames, (_, animal) = scene(60, things, camera=away)
+    masks = segment(frames).masks
+    gone = animal.sum((1, 2)) == 0
+    assert gone.sum() > 5
+    assert not masks[gone].any()
+    assert iou(masks, animal)[-6:].min() > 0.85
+    assert iou(masks, animal)[:6].min() > 0.85
+
+
+def test_what_stands_out_but_never_moves_is_no_subject():
+    frames, _ = scene(20, [(body, lambda t: 100.0, GREY)], camera=lambda t: 0.7 * t)
+    with pytest.raises(InvalidData, match="never moves"):
+        segment(frames)
+
+
+def test_motion_follows_the_one_that_is_picked():
+    found = {}
+    for k in range(6):
+        found[k] = np.zeros((H, W), bool)
+        found[k][20:60, 10 + k : 60 + k] = True
+        found[k][80:100, 120 - k : 150 - k] = True
+    frames = np.zeros((6, H, W, 3), np.uint8)
+    flow = dense_flow(frames)
+    assert all(m[30, 40] and not m[90, 130] for m in follow(found, flow, Choice()).values())
+    assert all(m[90, 130] and not m[30, 40] for m in follow(found, flow, Choice(2, point=(130.0, 90.0))).values())
+    with pytest.raises(InvalidData, match="nothing moves where --subject-at points"):
+        follow(found, flow, Choice(0, point=(190.0, 5.0)))
+
+
+def test_pieces_stay_and_strangers_do_not():
+    subject = np.zeros((H, W), bool)
+    subject[40:80, 60:120] = True
+    found = subject.copy()
+    found[:, 85:95] = False  # a post
+    found[30:60, 150:170] = True  # someone else
+    mine, theirs, sure = tell_apart(found, subject, np.zeros_like(subject), lambda piece: False)
+    np.testing.assert_array_equal(mine, found & subject)
+    assert theirs[40, 160]
+    assert sure[40, 160]
+    merged = subject | np.roll(subject, 30, axis=1)  # the other half is another's
+    mine, theirs, _ = tell_apart(merged, subject, np.roll(subject, 60, axis=1), lambda piece: False)
+    assert mine[60, 61:115].all()
+    assert theirs[60, 125:149].all()
+
+
+def test_shared_motion():
+    things = [(post, lambda t: 150.0, GREY), (body, lambda t: 60 + 2.0 * t, RED)]
+    frames, (still, animal) = scene(12, things, camera=lambda t: 1.0 * t)
+    motion = SharedMotion(dense_flow(frames))
+    velocity = motion.velocity(6, animal[6])
+    np.testing.assert_allclose(velocity, [4 * 2.0 * 256 / W, 0], atol=3.0)  # DIS smooths
+    share = motion.share(6, velocity)
+    assert share is not None
+    assert foreign(animal[6] | still[6], animal[6], share)[still[6]].mean() > 0.5
+    assert foreign(animal[6] | still[6], animal[6], share)[animal[6]].mean() < 0.05
+    assert motion.share(6, np.zeros(2)) is None
+    assert motion.liveliness(6, animal[6]) > 5 > 1 > motion.liveliness(6, still[6])
+
+
+def test_look_knows_its_own():
+    frames, (a, b) = scene(3, [(small_body, lambda t: 40.0, GREEN), (body, lambda t: 140.0, RED)])
+    look = Look()
+    for t in range(2):
+        look.learn(frames[t], b[t])
+    assert look.likeness(frames[2], b[2]) > 0.95
+    assert look.likeness(frames[2], a[2]) < 0.6
+
+
+VIDEO = dict(source_width=1280, source_height=720, rotation=0, width=640, height=360, start_s=1.0, fps=20.0)
+
+
+def test_what_the_user_points_at():
+    assert choose((), (), VIDEO, 50) == Choice()
+    assert choose((640, 180), (), VIDEO, 50) == Choice(0, point=(320.0, 90.0))
+    assert choose((), (100, 200, 60, 20, 2.0), VIDEO, 50) == Choice(20, box=(30.0, 10.0, 50.0, 100.0))
+    turned = VIDEO | dict(rotation=90, width=360, height=640)
+    assert choose((360, 1280), (), turned, 50).point == (180.0, 640.0)
+    for at, box, what in (
+        ((1, 2), (1, 2, 30, 40), "a point and a box"),
+        ((1,), (), "has 1 numbers"),
+        ((), (1, 2, 3), "has 3 numbers"),
+        ((2000, 10), (), "outside the picture"),
+        ((20, 10, 0.5), (), "not used"),
+        ((20, 10, 9.0), (), "1 to 3.45 s"),
+        ((), (10, 10, 12, 12), "less than 4 px"),
+    ):
+        with pytest.raises(UsageError, match=what):
+            choose(at, box, VIDEO, 50)
+
+
+def test_own_masks_say_who_it_is(tmp_path):
+    decoded = Artifact(npz={"frames.npz": {"frames": np.zeros((8, H, W, 3), np.uint8), "t": np.arange(8) / 30}})
+    with pytest.raises(UsageError, match="say who the subject is"):
+        run_masks(
+            Inputs(artifacts={"decode": decoded}, files={"masks": tmp_path}), MasksConfig(subject_at=(5, 5)), Silent()
+        )
