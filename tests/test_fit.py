@@ -92,7 +92,7 @@ def _inputs(masks: dict, flow: dict) -> Inputs:
     return Inputs(
         artifacts={
             "decode": Artifact(npz={"frames.npz": dict(t=np.arange(T) / FPS, frames=_frames(masks))}),
-            "masks": Artifact(npz={"masks.npz": masks, "flow.npz": flow}),
+            "masks": Artifact(npz={"masks.npz": masks, "flow.npz": flow}, json={"report.json": dict(quality_mean=1.0)}),
             "camera": Artifact(npz={"camera.npz": camera}, json={"report.json": dict(mode="moving")}),
         }
     )
@@ -119,6 +119,7 @@ def test_a_walk_is_found(walk):
     assert report["scale_source"] == "typical length of quadruped"
     assert report["swap_margin"] is not None
     assert report["evidence"] == []
+    assert report["verdict"]["trust"] in ("good", "fair")
     motion = KeypointMotion.from_arrays(out.npz["keypoints.npz"])
     names = load_skeleton("quadruped").names
     Y = true[:, [names.index(n) for n in motion.names]]
@@ -190,7 +191,8 @@ def test_masks_of_something_else_fail(walk):
     junk[:, 10:80:9, ::3] = True
     out = reconstruct(_inputs(masks | dict(packed=np.packbits(junk, axis=-1)), flow), TINY, Silent())
     assert out.failure
-    assert "covers the subject badly" in out.failure
+    assert "silhouette_iou" in out.failure
+    assert out.json["report.json"]["verdict"]["trust"] == "unusable"
 
 
 def test_parts_that_disagree_are_refused(walk):

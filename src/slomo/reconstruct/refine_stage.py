@@ -18,13 +18,10 @@ from slomo.reconstruct.observations import unpack
 from slomo.reconstruct.outcome import Outcome, assess
 from slomo.reconstruct.physics.learn import PhysicsConfig
 from slomo.reconstruct.run import Run, from_arrays
+from slomo.reconstruct.verdict import Facts, checks, verdict
 from slomo.stage import Artifact, Inputs, Progress
 
-REFINE_VERSION = 3
-
-# The rest pose at the right place overlaps by 0.5 to 0.6, a fit that is right by 0.75 and more. Below this the body is
-# elsewhere or another shape in many frames, and its key points do not follow the subject.
-MIN_IOU = 0.45
+REFINE_VERSION = 4
 
 
 @dataclass(frozen=True)
@@ -68,7 +65,7 @@ def run_refine(inputs: Inputs, config: ReconstructConfig, progress: Progress) ->
     """Refine the artifact "fit"; beside it, reads what `fit_stage.prepare` does.
 
     Returns:
-        keypoints.npz and report.json; `failure` is set when the body hardly overlaps the masks.
+        keypoints.npz and report.json; `failure` says why when the verdict is that they are not usable.
     """
     began, cpu = time.perf_counter(), time.process_time()
     made = prepare(inputs, config)
@@ -87,12 +84,29 @@ def run_refine(inputs: Inputs, config: ReconstructConfig, progress: Progress) ->
         "scale_source": source, "evidence": made.evidence, "quality": config.quality,
         "seconds": round(time.perf_counter() - began, 1), "cpu_seconds": round(time.process_time() - cpu, 1),
     }  # fmt: skip
-    iou = report["silhouette_iou"]
-    failure = None
-    if iou < MIN_IOU:
-        failure = f"the fitted body covers the subject badly (IoU {iou:.2f}, needs {MIN_IOU}); look at the masks"
+    report["verdict"] = found = verdict(checks(_facts(inputs, made, run, outcome)))
+    progress.note(f"verdict: {found['trust']}; {found['text']}")
+    failure = f"not usable: {found['text']}" if found["trust"] == "unusable" else None
     npz = {"keypoints.npz": _arrays(made, outcome), "mesh.npz": body.to_arrays()}
     return Artifact(npz=npz, json={"report.json": report}, failure=failure)
+
+
+def _facts(inputs: Inputs, made: Prepared, run: Run, outcome: Outcome) -> Facts:
+    kin, unit = made.problem.kin, outcome.metres_per_unit
+    shape = {k.removeprefix("shape."): v for k, v in run.x.items() if k.startswith("shape.")}
+    offset, rest = kin.offsets(shape)[0].norm(dim=-1), kin.offset.norm(dim=-1)
+    own = shape["log_length"].exp()[0]
+    bones = (rest > 0.03).numpy()
+    return Facts(
+        report=outcome.report,
+        masks=inputs.artifacts["masks"].json["report.json"],
+        camera=inputs.artifacts["camera"].json["report.json"],
+        feet=outcome.body.nodes[0, :, list(made.skeleton.contacts)].numpy().astype(float) * unit,
+        sole=made.skeleton.sole * float(own) * unit,
+        t=made.problem.obs.t.numpy().astype(float),
+        length=made.metres,
+        stretch=(offset / own / rest.clamp(min=1e-6)).numpy()[bones],
+    )
 
 
 def _mesh(made: Prepared, run: Run, outcome: Outcome, fields: FieldsConfig | None, frames: np.ndarray) -> SkinnedMesh:
