@@ -12,9 +12,13 @@ from slomo.reconstruct import certainty, sfm
 from slomo.reconstruct.camera import _key_frames, estimate_camera
 from slomo.reconstruct.tracks import Tracks
 from slomo.stage import Silent
-from test_camera import pan, settings, turned_views
+from test_camera import pan, settings, texture, turned_views
 
 CENTER = np.array([159.5, 119.5])
+
+
+class Stop(Exception):
+    """The interruption."""
 
 
 def structure(noise: float, cameras: int = 5, points: int = 40) -> sfm.Structure:
@@ -118,6 +122,62 @@ def test_background_that_is_nearly_all_masked_is_said():
     assert np.isfinite(path.T_world_cam).all()
 
 
+def layers(T: int) -> np.ndarray:
+    """Frames (T, 120, 160, 3) of a near strip that passes by a far one twice as fast."""
+    far, near = texture(120, 480, seed=1), texture(120, 480, seed=2)
+    frames = [np.vstack([far[:60, 2 * t : 2 * t + 160], near[60:, 4 * t : 4 * t + 160]]) for t in range(T)]
+    return np.repeat(np.array(frames)[..., None], 3, -1)
+
+
+def test_structure_from_motion_that_falls_to_pieces_is_named(monkeypatch):
+    tried = []
+
+    def pieces(frames, masks, keys, **options):
+        tried.append(len(keys))
+        return None
+
+    monkeypatch.setattr(sfm, "reconstruct_structure", pieces)
+    frames = layers(45)
+    path = estimate_camera(frames, np.zeros(frames.shape[:3], bool), np.arange(45) / 30, settings(300.0), Silent())
+    assert tried == [16]
+    assert path.report["parallax_px"] > path.report["parallax_limit_px"]
+    assert path.report["mode"] == "panning"
+    assert path.report["fallback"] == "structure from motion placed 0 of 16 key frames"
+
+
+class Saved(Silent):
+    """Progress that is interrupted right after its first checkpoint."""
+
+    def __init__(self, state=None):
+        self.state = state
+
+    def load(self):
+        return self.state
+
+    def save(self, state) -> None:
+        self.state = {k: np.array(v) for k, v in state.items()}
+        raise Stop
+
+
+def test_structure_is_not_made_twice(monkeypatch):
+    """Interrupted after structure from motion, the stage goes on from there."""
+    frames = layers(45)
+    keys = np.array([*range(0, 45, 3), 44])
+    s = structure(0.3, cameras=len(keys))
+    made = sfm.Structure(keys, s.T_world_cam, 300.0, s.points, s.observations, s.xy - CENTER + [79.5, 59.5], 0.3, 1.5)
+    arguments = frames, np.zeros(frames.shape[:3], bool), np.arange(45) / 30, settings(300.0)
+    monkeypatch.setattr(sfm, "reconstruct_structure", lambda *a, **k: made)
+    progress = Saved()
+    with pytest.raises(Stop):
+        estimate_camera(*arguments, progress)
+    monkeypatch.setattr(sfm, "reconstruct_structure", lambda *a, **k: pytest.fail("made again"))
+    path = estimate_camera(*arguments, Saved(progress.state))
+    assert path.report["mode"] == "moving"
+    assert path.report["key_frames_registered"] == path.report["key_frames"] == 16
+    assert path.report["fallback"] is None
+    assert 0 < path.report["focal_std_px"] < 300
+
+
 def test_featureless_background_is_said():
     frames = np.full((12, 120, 160, 3), 128, np.uint8)
     path = estimate_camera(frames, np.zeros(frames.shape[:3], bool), np.arange(12) / 24, settings(200.0), Silent())
@@ -133,10 +193,6 @@ def test_folders_of_killed_processes_are_removed(tmp_path, monkeypatch):
         (tmp_path / f"slomo-sfm-{owner}-x").mkdir()
     sfm._remove_orphans()
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted([f"slomo-sfm-{os.getpid()}-x", "slomo-sfm-other-x"])
-
-
-class Stop(Exception):
-    pass
 
 
 def test_waiting_ends_the_process_and_its_errors_are_kept(tmp_path):

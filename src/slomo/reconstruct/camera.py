@@ -22,7 +22,7 @@ _PARALLAX_PX = 0.5  # px, residual of the turning camera over a second and more,
 _LEAST_CORNERS = 12  # in a frame, in the median, below which the background says nothing about the camera
 _MOST_KEYS = 120  # key frames that are enough for any clip, as long as none is farther from the next than this:
 _KEY_GAP = 0.5  # s
-_MOST_PAIRS = 60_000  # correspondences for a turning camera, drawn from those there are
+_MOST_PAIRS = 24_000  # correspondences for a turning camera, drawn from those there are
 
 
 @dataclass(frozen=True)

@@ -133,8 +133,15 @@ def _normal_equations(residual, jacobian, weight, i, j, count):
     """J^T W J and J^T W r over 3 parameters a frame and log focal last."""
     size = 3 * count + 1
     H, g = np.zeros((size, size)), np.zeros(size)
-    columns = np.column_stack([3 * i[:, None] + np.arange(3), 3 * j[:, None] + np.arange(3), np.full(len(i), size - 1)])
-    blocks = np.einsum("pra,p,prb->pab", jacobian, weight, jacobian)
-    np.add.at(H, (columns[:, :, None], columns[:, None, :]), blocks)
-    np.add.at(g, columns, np.einsum("pra,p,pr->pa", jacobian, weight, residual))
+    # Thousands of correspondences share a pair of frames: they are summed before they are put in their places.
+    order = np.lexsort((j, i))
+    i, j, jacobian = i[order], j[order], jacobian[order]
+    starts = np.flatnonzero(np.r_[True, (np.diff(i) != 0) | (np.diff(j) != 0)])
+    weighted = jacobian * weight[order, None, None]
+    blocks = np.add.reduceat(np.swapaxes(weighted, 1, 2) @ jacobian, starts, axis=0)
+    slopes = np.add.reduceat((weighted * residual[order, :, None]).sum(1), starts, axis=0)
+    for a, b, block, slope in zip(i[starts], j[starts], blocks, slopes, strict=True):
+        columns = np.r_[3 * a : 3 * a + 3, 3 * b : 3 * b + 3, size - 1]
+        H[np.ix_(columns, columns)] += block
+        g[columns] += slope
     return H, g
