@@ -100,7 +100,7 @@ class Problem:
         return sum((self.weights[k] * v for k, v in parts.items()), torch.zeros(len(guess.yaw))), parts
 
 
-RATES = {"shape.log_length": 4e-3, "shape": 3e-2, "tilt": 2e-2, "Q": 4e-3, "G": 2e-3, "F": 4e-3}
+RATES = {"shape.log_length": 4e-3, "shape": 3e-2, "tilt": 2e-2, "Q": 4e-3, "G": 2e-3, "F": 4e-3, "F.background": 1e-2}
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,8 @@ class FieldsConfig:
     frequencies: int = 5
     delta_width: int = 24
     background_width: int = 64
-    background_frequencies: int = 7
-    beta: float = 0.01
+    background_frequencies: int = 8
+    beta: float = 0.006
     queried: int = 4
 
     def __post_init__(self):

@@ -16,7 +16,7 @@ Tensor = torch.Tensor
 
 NOISE = 0.02  # colour differences below this are noise, of a range of 1
 STEP = 0.005  # body lengths, of finite differences of the distance
-BEHIND = 32  # background pixels of a frame at most in one evaluation
+BEHIND = 64  # background pixels of a frame at most in one evaluation
 
 
 class Fields:
