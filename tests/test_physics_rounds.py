@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.physics.coupling import term
-from slomo.reconstruct.physics.learn import SPREAD, Learner, PhysicsConfig, Simulated
+from slomo.reconstruct.physics.learn import Learner, PhysicsConfig, Simulated
 from slomo.reconstruct.physics.model import build
 from slomo.reconstruct.physics.windows import Kinematic, cover, guides
 from slomo.skeleton import load_skeleton
@@ -24,7 +24,9 @@ def kinematic(T: int = 25, fps: float = 30.0, *, speed: float = 0.0, sunk: float
     height = SKELETON.root_height * LENGTH - sunk
     position = np.stack([speed * t, 0 * t, 0 * t + height], 1)
     nodes = position[:, None] + SKELETON.rest() * LENGTH
-    return Kinematic(t, position, np.tile(np.eye(3), (T, 1, 1)), np.zeros((T, SKELETON.link_count, 3)), nodes)
+    contact = np.zeros(nodes.shape[:2])
+    contact[:, list(SKELETON.contacts)] = 1
+    return Kinematic(t, position, np.tile(np.eye(3), (T, 1, 1)), np.zeros((T, SKELETON.link_count, 3)), nodes, contact)
 
 
 def learner(k: Kinematic, **config) -> Learner:
@@ -53,7 +55,7 @@ def test_guides_pass_through_the_motion_with_its_velocities():
     place = np.stack([0.5 * t, -0.2 * t, 1 + 0 * t], 1)
     q = np.zeros((40, 3, 3))
     q[:, 1, 1] = np.sin(4 * t)
-    k = Kinematic(t, place, R, q, np.zeros((40, 4, 3)))
+    k = Kinematic(t, place, R, q, np.zeros((40, 4, 3)), np.zeros((40, 4)))
     w = cover(t, length=0.8, overlap=0.2, dt=0.005, knot=0.1)
     g = guides(k, w)
     when = w.start[:, None] + w.dt * np.arange(w.steps + 1)
@@ -68,24 +70,20 @@ def test_learning_makes_the_body_stand_where_it_should():
     one = learner(kinematic(sunk=0.01))
     x = one.start()
     raw = one.simulate(x, 0.001)
-    assert raw.trust.min() == 1
+    assert raw.trust == pytest.approx(1)
     error = lambda s: np.linalg.norm(s.nodes - one.kinematic.nodes, axis=-1).mean() / LENGTH  # noqa: E731
-    x, losses = one.learn(x, np.full(40, 0.001), rate=0.1)
+    x, losses = one.learn(x, np.full(60, 0.001), rate=0.05)
     learned = one.simulate(x, 0.001)
     assert min(losses) < 0.6 * losses[0]
     assert error(learned) < 0.7 * error(raw)
-    weight = one.body.weight * np.exp(-SPREAD["log_size"] * float(x["log_size"]))
-    assert learned.force[5:-5, :, 2].sum(1).mean() == pytest.approx(weight, rel=0.1)
     assert learned.report["assisting_force_of_weight"] < 0.01
 
 
 def test_what_no_body_can_do_is_not_done():
     """A body that glides on feet that stand: friction holds the feet, which slide in the kinematic motion."""
-    one = learner(kinematic(speed=0.2), window=0.8)
-    x, _ = one.learn(one.start(), np.full(40, 0.001), rate=0.1)
-    feet = one.simulate(x, 0.001).nodes[:, list(SKELETON.contacts), :2]
-    slide = np.linalg.norm(np.diff(feet, axis=0), axis=-1).mean() * 30
-    assert slide < 0.6 * 0.2
+    one = learner(kinematic(speed=0.1))
+    feet = one.simulate(one.start(), 0.001).nodes[3:, list(SKELETON.contacts), :2]
+    assert np.linalg.norm(np.diff(feet, axis=0), axis=-1).mean() * 30 < 0.2 * 0.1
 
 
 def test_learning_is_deterministic_and_goes_on_from_plain_arrays():
@@ -100,7 +98,7 @@ def test_a_window_that_fell_is_not_trusted():
     upside = kinematic()
     R = Rotation.from_rotvec(t[:, None] * np.array([9.0, 0, 0])).as_matrix()  # spins in the air, far up
     nodes = np.einsum("tij,mj->tmi", R, SKELETON.rest() * LENGTH) + upside.position[:, None]
-    one = learner(Kinematic(t, upside.position, R, upside.q, nodes))
+    one = learner(Kinematic(t, upside.position, R, upside.q, nodes, 0 * upside.contact))
     lost = one.simulate(one.start(), 0.0)
     assert lost.report["lost_windows"] == one.windows.count
     assert lost.trust.max() == 0

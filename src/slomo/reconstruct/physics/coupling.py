@@ -76,14 +76,17 @@ class Physics:
         length = shape["log_length"].exp()
         offset = problem.kin.offsets(shape)
         # With the feet held where they stand: feet that slide cannot be followed.
-        posed, _, q = stood(problem, x, guess)
+        posed, stands, q = stood(problem, x, guess)
         unit = self.metres / own_length(problem, shape)
         f = lambda v: v[0].numpy().astype(float)  # noqa: E731
         body = build(
             skeleton, f(offset) * unit, f(posed.radii) * unit, length=float(length[0]) * unit, mechanics=self.mechanics
         )
         t = problem.obs.t.numpy().astype(float)
-        kinematic = Kinematic(t, f(posed.nodes)[:, 0] * unit, f(posed.R)[:, 0], f(q), f(posed.nodes) * unit)
+        nodes = f(posed.nodes)
+        contact = np.zeros(nodes.shape[:2])
+        contact[:, list(skeleton.contacts)] = stands
+        kinematic = Kinematic(t, nodes[:, 0] * unit, f(posed.R)[:, 0], f(q), nodes * unit, contact)
         return body, kinematic, unit
 
 

@@ -13,6 +13,7 @@ Array = np.ndarray
 DENSITY = 1000.0  # kg/m^3, flesh
 GRAVITY = 9.81  # m/s^2
 LEAST_MASS = 0.002  # of the whole body's: a link without volume of its own still has this
+SAME = 0.08  # body lengths between two places on a link that are one contact point
 CELL = 0.01  # body lengths, of the grid of points whose mass is summed
 
 
@@ -31,8 +32,8 @@ class Mechanics:
             damped.
     """
 
-    stiffness: float = 1.0
-    damping: float = 0.15
+    stiffness: float = 2.0
+    damping: float = 0.1
     ke: float = 100.0
     kd: float = 2.0
     mu: float = 0.9
@@ -159,7 +160,7 @@ def _contacts(
     out = list(feet)
     for c, i in enumerate(skeleton.capsule_link):
         for e in range(2):
-            if any(i == link and np.linalg.norm(ends[c, e] - x) < 0.03 * length for link, x, *_ in out):
+            if any(i == link and np.linalg.norm(ends[c, e] - x) < SAME * length for link, x, *_ in out):
                 continue
             height = rest[i, 2] + ends[c, e, 2] - floor
             out.append((int(i), ends[c, e], float(min(radii[c, e], max(height, 0.0))), -1))

@@ -11,8 +11,6 @@ from slomo.reconstruct.physics.model import GRAVITY, Body
 
 Tensor = torch.Tensor
 
-DT = 0.002  # s at most; what is stiff is integrated implicitly, so this is for accuracy alone
-
 
 @dataclass(frozen=True)
 class Controls:

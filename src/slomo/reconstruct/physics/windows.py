@@ -22,6 +22,7 @@ class Kinematic:
 
     Attributes:
         t: (T,) s. position: (T, 3) m and R: (T, 3, 3) of the root. q: (T, B, 3) rad. nodes: (T, M, 3) m.
+        contact: (T, M) probability that the node stands on the ground.
     """
 
     t: Array
@@ -29,6 +30,7 @@ class Kinematic:
     R: Array
     q: Array
     nodes: Array
+    contact: Array
 
 
 @dataclass(frozen=True)
@@ -96,8 +98,13 @@ def _basis(steps: int, span: float, knot: float) -> Tensor:
 
 @dataclass(frozen=True)
 class Guides:
-    """The kinematic trajectory at every step of N windows: position (N, S + 1, 3) m, quaternion (N, S + 1, 4) xyzw,
-    velocity (N, 3) and spin (N, 3) rad/s in world axes at the start, q (N, S + 1, B, 3) rad; nodes (N, F, M, 3) m."""
+    """The kinematic trajectory in N windows, in world axes.
+
+    Attributes:
+        position: (N, S + 1, 3) m, quaternion: (N, S + 1, 4) xyzw of the root, q: (N, S + 1, B, 3) rad, at every step.
+        velocity: (N, 3) m/s, spin: (N, 3) rad/s of the root at the start.
+        nodes: (N, F, M, 3) m, contact: (N, F, M) at the moments.
+    """
 
     position: Tensor
     quaternion: Tensor
@@ -105,6 +112,7 @@ class Guides:
     spin: Tensor
     q: Tensor
     nodes: Tensor
+    contact: Tensor
 
 
 def guides(kinematic: Kinematic, windows: Windows) -> Guides:
@@ -124,5 +132,5 @@ def guides(kinematic: Kinematic, windows: Windows) -> Guides:
     return Guides(
         position=f(place(at)), quaternion=f(quaternion), velocity=f(place(windows.start, 1)), spin=f(spin),
         q=f(CubicSpline(t, kinematic.q.reshape(T, -1))(at)).reshape(*at.shape, *kinematic.q.shape[1:]),
-        nodes=f(kinematic.nodes[windows.frame]),
+        nodes=f(kinematic.nodes[windows.frame]), contact=f(kinematic.contact[windows.frame]),
     )  # fmt: skip
