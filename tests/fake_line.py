@@ -29,6 +29,8 @@ class DecodeConfig:
 @dataclasses.dataclass(frozen=True)
 class MasksConfig:
     segmenter: str = "motion"
+    subject_at: tuple[float, ...] = ()
+    subject_box: tuple[float, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)

@@ -157,6 +157,20 @@ def test_options_are_written_into_the_users_file(project):
     assert "skeleton" not in settings.read(project, list(pipeline.STAGES))["inputs"]
 
 
+def test_whom_the_user_means(project):
+    def masks():
+        return settings.read(project, list(pipeline.STAGES)).get("masks", {})
+
+    run("reconstruct", "clip.txt", "--subject-at", "320,180.5,1")
+    assert masks() == {"subject_at": [320.0, 180.5, 1.0]}
+    run("reconstruct", "--subject-box", "10,20,300,200")
+    assert masks() == {"subject_box": [10.0, 20.0, 300.0, 200.0]}
+    run("reconstruct", "--subject-box", "none")
+    assert masks() == {}
+    assert "no list of numbers" in run("reconstruct", "--subject-at", "here", code=2).stderr
+    assert "give one of them" in run("reconstruct", "--subject-at", "1,2", "--subject-box", "1,2,3,4", code=2).stderr
+
+
 def test_masks_given_are_used(project):
     (project / "masks").mkdir()
     run("reconstruct", "clip.txt", "--segmenter", "motion")

@@ -9,7 +9,7 @@ import pytest
 from slomo.errors import InvalidData, UsageError
 from slomo.reconstruct.flow import dense_flow
 from slomo.reconstruct.motion_segment import border_distance
-from slomo.reconstruct.segment import blend_over_time, component_at, frame_quality
+from slomo.reconstruct.segment import blend_over_time, component_at, frame_certainty, frame_quality, spans
 from slomo.reconstruct.stage import DecodeConfig, MasksConfig, pack, run_decode, run_masks, unpack
 from slomo.stage import Artifact, Inputs, Silent
 
@@ -102,6 +102,23 @@ def test_quality_falls_where_the_mask_jumps():
     broken[5] = np.roll(masks[5], 30, axis=1)
     assert frame_quality(broken, flow)[5] < 0.6 * good[5]
     assert frame_quality(np.zeros_like(masks), flow).max() == 0
+    sure = np.where(np.arange(10) == 5, 0.5, 0.95)
+    quality = frame_quality(masks, flow, sure)
+    assert quality[5] < 0.75 < 0.9 < np.delete(quality, 5).min()
+    halved = masks.copy()
+    halved[4, :, : int(np.flatnonzero(masks[4].any(0)).mean())] = False
+    assert frame_quality(halved, flow, np.full(10, 0.95))[4] < 0.9
+
+
+def test_certainty_and_spans():
+    mask = np.zeros((10, 10), bool)
+    mask[2:8, 2:8] = True
+    assert frame_certainty(mask.astype(np.float32), mask) == 1.0
+    assert frame_certainty(np.where(mask, 0.6, 0.0), mask) == pytest.approx(0.6)
+    assert frame_certainty(np.where(mask, 1.0, 0.3), mask) < 0.8
+    assert frame_certainty(np.zeros((10, 10)), np.zeros_like(mask)) == 0.0
+    assert spans(np.array([True, True, False, True])) == [[0, 1], [3, 3]]
+    assert spans(np.zeros(4, bool)) == []
 
 
 @pytest.mark.parametrize("camera", [0.0, 1.0])

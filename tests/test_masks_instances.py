@@ -182,7 +182,7 @@ def test_shared_motion():
     assert foreign(animal[6] | still[6], animal[6], share)[still[6]].mean() > 0.5
     assert foreign(animal[6] | still[6], animal[6], share)[animal[6]].mean() < 0.05
     assert motion.share(6, np.zeros(2)) is None
-    assert motion.liveliness(6, animal[6]) > 5 > 1 > motion.liveliness(6, still[6])
+    assert motion.liveliness(6, animal[6]) > 1 > motion.liveliness(6, still[6])
 
 
 def test_look_knows_its_own():

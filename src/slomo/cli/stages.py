@@ -15,6 +15,14 @@ SegmenterOption = Annotated[
     str | None, typer.Option("--segmenter", metavar="auto|u2netp|motion|user", help="How the subject is found.")
 ]
 MasksOption = Annotated[Path | None, typer.Option("--masks", metavar="DIR", help="Your own masks, one image a frame.")]
+AtOption = Annotated[
+    str | None,
+    typer.Option("--subject-at", metavar="U,V[,S]|none", help="Of several, the one at this pixel (at this second)."),
+]
+BoxOption = Annotated[
+    str | None,
+    typer.Option("--subject-box", metavar="U0,V0,U1,V1[,S]|none", help="Of several, the one in this box of pixels."),
+]
 WeightsOption = Annotated[Path | None, typer.Option("--weights", help="U2-Net-p weights (.onnx).")]
 StartOption = Annotated[float | None, typer.Option("--start", help="First second of the clip to use.")]
 DurationOption = Annotated[float | None, typer.Option("--duration", help="Seconds to use; 0: all.")]
@@ -89,6 +97,7 @@ def _from_clip(
     skeleton: str | None,
     segmenter: str | None,
     masks: Path | None,
+    subject: dict[str, Any],
     weights: Path | None,
     start: float | None,
     duration: float | None,
@@ -104,11 +113,27 @@ def _from_clip(
     changes["inputs"] = changes.get("inputs", {}) | inputs | evidence["inputs"]
     changes["evidence"] = evidence["evidence"]
     changes["decode"] = _given(start=start, duration=duration)
-    changes["masks"] = _given(segmenter=segmenter)
+    changes["masks"] = _given(segmenter=segmenter) | subject
     if masks is not None and segmenter is None:
-        changes["masks"] = {"segmenter": None}  # the default takes the masks that are given
+        changes["masks"]["segmenter"] = None  # the default takes the masks that are given
     changes["camera"] = _given(fov_deg=fov)
     changes["reconstruct"] = changes.get("reconstruct", {}) | _given(length_m=length, quality=quality)
+    return changes
+
+
+def _subject(at: str | None, box: str | None) -> dict[str, Any]:
+    """Whom the user means, as parameters of the masks. "none" goes back to the largest; the one unsets the other."""
+    given = {"subject_at": at, "subject_box": box}
+    wanted = {name: text for name, text in given.items() if text not in (None, "none")}
+    if len(wanted) == 2:
+        raise UsageError("a point and a box are given", where="--subject-at, --subject-box", todo="give one of them")
+    changes: dict[str, Any] = dict.fromkeys(given) if wanted else {n: None for n, text in given.items() if text}
+    for name, text in wanted.items():
+        try:
+            changes[name] = [float(x) for x in str(text).split(",")]
+        except ValueError:
+            where = "--" + name.replace("_", "-")
+            raise UsageError(f"{text!r} is no list of numbers", where=where, valid=["for example 320,180"]) from None
     return changes
 
 
@@ -126,6 +151,8 @@ def add_commands(app: typer.Typer) -> None:
         skeleton: SkeletonOption = None,
         segmenter: SegmenterOption = None,
         masks: MasksOption = None,
+        subject_at: AtOption = None,
+        subject_box: BoxOption = None,
         weights: WeightsOption = None,
         start: StartOption = None,
         duration: DurationOption = None,
@@ -145,11 +172,23 @@ def add_commands(app: typer.Typer) -> None:
         slomo reconstruct cat.mp4
         slomo reconstruct cat.mp4 --duration 4 --length 0.45 --quality draft
         slomo reconstruct man.mp4 --skeleton human
+        slomo reconstruct two.mp4 --subject-at 640,300,1.5
         slomo reconstruct cat.mp4 --prior none --keypoints2d points.json
         """
         evidence = _evidence(session, prior, keypoints2d, keypoint_model, keypoint_map)
         changes = _from_clip(
-            session, skeleton, segmenter, masks, weights, start, duration, length, quality, fov, evidence
+            session,
+            skeleton,
+            segmenter,
+            masks,
+            _subject(subject_at, subject_box),
+            weights,
+            start,
+            duration,
+            length,
+            quality,
+            fov,
+            evidence,
         )
         if clip is not None:
             changes["inputs"] |= {"clip": session.user_path(clip, "clip")} | session.choice_reopened("clip")
@@ -245,6 +284,8 @@ def add_commands(app: typer.Typer) -> None:
         skeleton: SkeletonOption = None,
         segmenter: SegmenterOption = None,
         masks: MasksOption = None,
+        subject_at: AtOption = None,
+        subject_box: BoxOption = None,
         weights: WeightsOption = None,
         start: StartOption = None,
         duration: DurationOption = None,
@@ -261,11 +302,23 @@ def add_commands(app: typer.Typer) -> None:
         \b
         slomo run cat.mp4 --robot go1
         slomo run cat.mp4 --robot go1 --duration 4 --length 0.45
+        slomo run two.mp4 --robot go1 --subject-box 500,200,800,420
         slomo run cat00.json --robot go1
         """
         evidence = _evidence(session, prior, keypoints2d, keypoint_model, keypoint_map)
         changes = _from_clip(
-            session, skeleton, segmenter, masks, weights, start, duration, length, quality, fov, evidence
+            session,
+            skeleton,
+            segmenter,
+            masks,
+            _subject(subject_at, subject_box),
+            weights,
+            start,
+            duration,
+            length,
+            quality,
+            fov,
+            evidence,
         )
         inputs = changes["inputs"]
         inputs |= _truth(session, truth)

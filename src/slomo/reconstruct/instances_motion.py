@@ -13,6 +13,7 @@ _MOVES = 2.0  # px at that size and over that gap, from which on a body as a who
 _FOREIGN = 0.2  # part of the body's motion, below which a patch does not share it
 _LOST = 64.0  # px, a motion that flow cannot have followed
 _ASTRAY = 1.5  # px, median motion of the whole picture, from which on the homography has not been found
+_BENDS = 1.5  # px of motion that no flat thing has, from which on a body is said to be alive
 _KEPT = 64  # frames whose motion is remembered
 
 
@@ -52,9 +53,18 @@ class SharedMotion:
         return np.median(inside, axis=0) if len(inside) > 10 else np.zeros(2, np.float32)
 
     def liveliness(self, t: int, mask: np.ndarray) -> float:
-        """How fast the liveliest tenth of (H, W) bool moves in frame t, px at `_SIDE` over `_GAP` frames."""
-        inside = self._inside(t, mask)
-        return float(np.quantile(np.linalg.norm(inside, axis=-1), 0.9)) if len(inside) > 10 else 0.0
+        """How surely (H, W) bool is alive in frame t; from 1 on it is: it moves fast as a whole, or its liveliest tenth
+        moves in a way that no flat thing does (what an affine motion leaves), as parallax cannot make a box do."""
+        small = cv2.resize(mask.astype(np.float32), self._size, interpolation=cv2.INTER_AREA) > 0.9
+        y, x = np.nonzero(small & np.isfinite(self.residual(t)[..., 0]))
+        if len(x) < 20:
+            return 0.0
+        motion = self.residual(t)[y, x]
+        design = np.stack([x, y, np.ones(len(x))], 1).astype(np.float32)
+        rest = np.linalg.norm(motion - design @ np.linalg.lstsq(design, motion, rcond=None)[0], axis=-1)
+        calm = rest <= np.quantile(rest, 0.7)  # limbs must not bend the motion of the whole
+        rest = np.linalg.norm(motion - design @ np.linalg.lstsq(design[calm], motion[calm], rcond=None)[0], axis=-1)
+        return float(max(np.quantile(rest, 0.9) / _BENDS, np.linalg.norm(np.median(motion, axis=0)) / (2 * _MOVES)))
 
     def _inside(self, t: int, mask: np.ndarray) -> np.ndarray:
         """(n, 2) what of the residual is known and lies in (H, W) bool."""

@@ -88,7 +88,7 @@ class MotionSegmenter:
             masks[t] = component_at(p > 0.45, reach=round(0.06 * np.sqrt((p > 0.5).sum())))
         if not masks.any():
             raise no_subject("what moves has no colours of its own")
-        return Masks(masks, {"motion_px": strength, "motion_gap_frames": self.gap})
+        return Masks(masks, None, {"motion_px": strength, "motion_gap_frames": self.gap})
 
 
 def shrink_flow(flow: Flow, size: tuple[int, int]) -> Flow:

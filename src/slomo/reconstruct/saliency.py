@@ -9,11 +9,19 @@ from slomo.reconstruct.colour import cut, learn_colours, to_lab
 from slomo.reconstruct.flow import Flow, sample
 from slomo.reconstruct.instances import Choice, Look, components, distance, tell_apart
 from slomo.reconstruct.instances_motion import SharedMotion, foreign
-from slomo.reconstruct.segment import Masks, Report, blend_over_time, box_of, component_at, grown, no_subject
+from slomo.reconstruct.segment import (
+    Masks,
+    Report,
+    blend_over_time,
+    box_of,
+    component_at,
+    frame_certainty,
+    grown,
+    no_subject,
+)
 from slomo.reconstruct.u2net import U2Net
 
 _FOREIGN = 0.17  # part of a mask in patches of the surroundings' colours, from which on it is cut anew
-_ALIVE = 1.0  # px of motion, see SharedMotion.liveliness, that some frame of an animal shows
 _FAST = 6.0  # px of motion that make a start no better
 _ALIKE = 0.75  # likeness from which on a piece may be the subject's
 _SURELY_ALIKE = 0.9  # the same of a piece that does not move as the subject did
@@ -56,19 +64,20 @@ class SaliencySegmenter:
         repaired = _give_back_surroundings(frames, layers)
         progress(0.8)
         probability = blend_over_time(layers, flow, lambda f: progress(0.8 + 0.15 * f))
-        masks = np.empty(frames.shape[:3], bool)
+        masks, certainty = np.empty(frames.shape[:3], bool), np.zeros(T)
         for t, p in enumerate(probability):
             pieces = components(p > 0.5, 1)
             least = 0.01 * pieces[0].sum() if pieces else 0
             pieces = [c for c in pieces if c.sum() >= least and p[c].max() > 0.8]
             masks[t] = np.logical_or.reduce(pieces) if pieces else False
+            certainty[t] = frame_certainty(p, masks[t])
         if not masks.any():
             raise no_subject("the network's answer does not hold over time")
-        if self.choice.how == "largest" and max(motion.liveliness(t, masks[t]) for t in keys) < _ALIVE:
+        if self.choice.how == "largest" and np.quantile([motion.liveliness(t, masks[t]) for t in keys], 0.9) < 1:
             raise no_subject("what stands out in the picture never moves against the background")
         report |= {"weights_sha256": self.network.digest, "network_frames": len(keys), "seed_frame": seed}
         report |= {"frames_with_others": told, "frames_lost": sum(not p.any() for p in layers.values())}
-        return Masks(masks, report | {"colour_repaired_frames": repaired})
+        return Masks(masks, certainty, report | {"colour_repaired_frames": repaired})
 
     def _start(self, keys: list[int], frames: np.ndarray, motion: SharedMotion, progress: Report):
         """The frame to start from, the subject and the others in it (H, W) bool, and what the report says of that.

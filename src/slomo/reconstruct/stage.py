@@ -13,7 +13,7 @@ from slomo.reconstruct.video import decode
 from slomo.stage import Artifact, Inputs, Progress
 
 DECODE_VERSION = 2
-MASKS_VERSION = 3
+MASKS_VERSION = 4
 CAMERA_VERSION = 4
 
 SEGMENTERS = ("auto", "u2netp", "motion", "user")
@@ -123,7 +123,7 @@ def run_masks(inputs: Inputs, config: MasksConfig, progress: Progress) -> Artifa
     """
     from slomo.reconstruct.flow import dense_flow
     from slomo.reconstruct.instances import choose
-    from slomo.reconstruct.segment import frame_quality
+    from slomo.reconstruct.segment import frame_quality, spans
 
     decoded = inputs.artifacts["decode"]
     frames = decoded.npz["frames.npz"]["frames"]
@@ -132,17 +132,24 @@ def run_masks(inputs: Inputs, config: MasksConfig, progress: Progress) -> Artifa
     progress.note(f"masks: segmenter {segmenter.name}")
     flow = dense_flow(frames, lambda f: progress.update(0.25 * f, "optical flow"))
     found = segmenter.segment(frames, flow, lambda f: progress.update(0.25 + 0.7 * f, f"masks ({segmenter.name})"))
-    quality = frame_quality(found.masks, flow)
+    quality = frame_quality(found.masks, flow, found.certainty)
+    seen = np.asarray(found.masks.any((1, 2)))
     report = {
         "segmenter": segmenter.name,
-        "quality_mean": float(quality.mean()),
-        "quality_min": float(quality.min()),
+        "quality_mean": float(quality[seen].mean()),
+        "quality_min": float(quality[seen].min()),
+        "quality_poor_frames": int((quality[seen] < 0.7).sum()),
         "area_mean": float(found.masks.mean()),
-        "frames_without_subject": int((~found.masks.any((1, 2))).sum()),
+        "frames_without_subject": int((~seen).sum()),
+        "spans_without_subject": spans(~seen),
         "flow_consistent": float(flow.consistent.mean()),
     } | found.report
-    if quality.mean() < 0.6:
-        progress.note(f"masks: poor (quality {quality.mean():.2f}); look at them, or give your own with --masks")
+    if found.report.get("instances", 1) > 1 and choice.how == "largest":
+        progress.note("masks: several subjects are seen, the largest is taken (choose with --subject-at U,V)")
+    if not seen.all():
+        progress.note(f"masks: no subject in {int((~seen).sum())} of {len(seen)} frames, they are bridged")
+    if quality[seen].mean() < 0.6:
+        progress.note(f"masks: poor (quality {quality[seen].mean():.2f}); look at them, or give your own with --masks")
     return Artifact(
         npz={
             "masks.npz": {**pack(found.masks), "quality": quality.astype(np.float32)},
