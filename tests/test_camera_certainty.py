@@ -74,6 +74,13 @@ def test_focal_certainty_is_that_of_the_whole_bundle_adjustment():
     assert certainty.focal_std(s, CENTER) == pytest.approx(expected, rel=1e-3)
 
 
+def test_focal_certainty_of_many_cameras_is_computed_from_some(monkeypatch):
+    s = structure(0.4, cameras=12)
+    full = certainty.focal_std(s, CENTER)
+    monkeypatch.setattr(certainty, "_MOST_CAMERAS", 6)
+    assert full < certainty.focal_std(s, CENTER) < 3 * full
+
+
 def test_certainty_of_a_plane_is_its_spread_over_draws():
     rng = np.random.default_rng(0)
     said, tilts = [], []

@@ -4,7 +4,7 @@ import numpy as np
 
 from slomo.reconstruct.sfm import Structure
 
-_MOST_POINTS = 1200  # that the focal length's certainty is computed from
+_MOST_CAMERAS, _MOST_POINTS = 120, 1200  # that the focal length's certainty is computed from, about
 _DEPENDENT = 10.0  # observations of one point are not independent: counted as if a tenth of them were there
 _BLOCKS = 8
 
@@ -18,11 +18,13 @@ def focal_std(structure: Structure, center: np.ndarray) -> float:
     Args:
         center: (2,) px, principal point.
     """
-    N = len(structure.frames)
+    thin = max(1, len(structure.frames) // _MOST_CAMERAS)
     image, point = structure.observations.T
+    N, image = -(-len(structure.frames) // thin), np.where(image % thin == 0, image // thin, -1)
     residual, by_pose, by_focal, by_point = _linearise(structure, center)
     order = np.argsort(point, kind="stable")
-    ends = np.cumsum(np.bincount(point, minlength=len(structure.points)))[:-1]
+    order = order[image[order] >= 0]
+    ends = np.cumsum(np.bincount(point[order], minlength=len(structure.points)))[:-1]
     groups = [g for g in np.split(order, ends) if len(g) >= 3]
     used = groups[:: max(1, -(-len(groups) // _MOST_POINTS))]
     S = np.zeros((6 * N + 1, 6 * N + 1))
