@@ -1,6 +1,7 @@
-"""What each term of the prior does to the reconstruction: one table over rendered clips, `make bench-terms`.
+"""What each term of the prior, or each part of the method, does to the reconstruction: one table over rendered clips,
+`make bench-terms` and `make bench-parts`.
 
-    python tests/bench_terms.py OUT [--seeds 2] [--terms all] [--clips a,b]
+    python tests/bench_terms.py OUT [--seeds 2] [--terms some|all|parts] [--clips a,b]
 
 Every cell is `slomo reconstruct` in a project below OUT, so a bench that was stopped goes on; the figures are ratios to
 the fit without the prior. Clips: those in ../shared/truth where there are any, and some that slomo renders.
@@ -21,14 +22,30 @@ from slomo.synth.score import score
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared"
 TERMS = ("view", "keypoints", "parts", "surface")
+CHANGED = (
+    *(f"weight_{t}" for t in (*TERMS, "background", "flow", "field_flow")), "fields", "physics", "candidates",
+)  # fmt: skip
 SYNTH = {
     "synth_trot_cat": ["--animal", "cat", "--gait", "trot", "--view", "40", "--camera", "orbit", "--seed", "21"],
     "synth_turn_horse": ["--animal", "horse", "--gait", "walk", "--turn", "35", "--view", "-20", "--seed", "22"],
 }
 
+FIGURES = ("pa_mpjpe_percent", "w_mpjpe_percent", "foot_mpjpe_percent", "foot_slide_mps", "cpu_seconds")
+
 
 def variants(which: str) -> dict[str, list[str]]:
-    """Name -> options: without the prior, with each term alone, with all but one, with all."""
+    """Name -> options: without the prior, with each term alone, with all but one, with all; or without each part."""
+    if which == "parts":
+        return {
+            "all": [],
+            "no refinement": ["--set=reconstruct.fields=false", "--set=reconstruct.physics=false"],
+            "no fields": ["--set=reconstruct.fields=false"],
+            "no physics": ["--set=reconstruct.physics=false"],
+            "no background": ["--set=reconstruct.weight_background=0"],
+            "no flow": ["--set=reconstruct.weight_flow=0", "--set=reconstruct.weight_field_flow=0"],
+            "no gait hypotheses": ["--set=reconstruct.candidates=1"],
+            "no prior": ["--prior", "none"],
+        }
     off = {t: f"--set=reconstruct.weight_{t}=0" for t in TERMS}
     out = {"none": ["--prior", "none"], "all": []}
     if which == "all":
@@ -62,10 +79,9 @@ def run(out: Path, name: str, clip: Path, options: list[str], seed: int) -> dict
     weights = SHARED / "weights" / "u2netp.onnx"
     args = ["--skeleton", "human"] if str(truth["kind"]) == "human" else []
     args += ["--weights", str(weights)] if weights.exists() else []
-    # Every parameter that a variant may have changed is set anew.
-    reset = [f"--set=reconstruct.weight_{t}={default}" for t, default in defaults().items()]
+    # Every parameter that a variant may have changed goes back to its default.
     given = {o.split("=")[1] for o in options if o.startswith("--set")}
-    reset = [r for r in reset if r.split("=")[1] not in given]
+    reset = [f"--set=reconstruct.{name}=" for name in CHANGED if f"reconstruct.{name}" not in given]
     prior = [] if "--prior" in options else ["--prior", "auto"]
     path = slomo(
         "--project", str(project), "reconstruct", str(clip / "clip.mp4"), *args, *prior, *options, *reset,
@@ -77,31 +93,25 @@ def run(out: Path, name: str, clip: Path, options: list[str], seed: int) -> dict
     return score(motion, truth) | {"cpu_seconds": report["cpu_seconds"]}
 
 
-def defaults() -> dict[str, float]:
-    from slomo.reconstruct.fit_stage import FitConfig
-
-    return {t: getattr(FitConfig(), f"weight_{t}") for t in TERMS}
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--terms", choices=("some", "all"), default="all")
+    parser.add_argument("--terms", choices=("some", "all", "parts"), default="all")
     parser.add_argument("--clips", default="")
     args = parser.parse_args()
     chosen = {n: p for n, p in clips(args.out).items() if not args.clips or n in args.clips.split(",")}
-    heads = ("PA %", "W %", "feet %", "PA ratio", "swaps", "CPU ratio")
+    heads = ("PA %", "W %", "feet %", "slide m/s", "PA ratio", "swaps", "CPU ratio")
     print(f"{'clip':<18} {'variant':<20} " + " ".join(f"{h:>9}" for h in heads))
     for name, clip in chosen.items():
         base: dict[str, float] = {}
         for variant, options in variants(args.terms).items():
             rows = [run(args.out, name, clip, options, seed) for seed in range(args.seeds)]
-            mean = {k: float(np.mean([r[k] for r in rows])) for k in
-                    ("pa_mpjpe_percent", "w_mpjpe_percent", "foot_mpjpe_percent", "cpu_seconds")}  # fmt: skip
+            mean = {k: float(np.mean([np.nan if r[k] is None else r[k] for r in rows])) for k in FIGURES}
             base = base or mean
             swaps = sum(bool(r["swapped"]) for r in rows)
             cells = [f"{mean[k]:9.1f}" for k in ("pa_mpjpe_percent", "w_mpjpe_percent", "foot_mpjpe_percent")]
+            cells += [f"{mean['foot_slide_mps']:9.3f}"]
             cells += [f"{mean['pa_mpjpe_percent'] / base['pa_mpjpe_percent']:9.2f}", f"{swaps:>5}/{len(rows):<3}"]
             cells += [f"{mean['cpu_seconds'] / base['cpu_seconds']:9.2f}"]
             print(f"{name:<18} {variant:<20} " + " ".join(cells), flush=True)

@@ -173,5 +173,6 @@ def test_score_agrees_with_the_judge():
         ("foot_mpjpe_percent", "foot_mpjpe_pct"),
         ("root_path_error_percent", "root_traj_error_pct_of_distance"),
         ("gravity_error_degrees", "gravity_error_deg"),
+        ("foot_slide_mps", "foot_slide_mps_in_true_contact"),
     ):
         assert ours[mine] == pytest.approx(theirs[his], abs=1e-3)

@@ -91,9 +91,9 @@ def checks(f: Facts) -> list[Check]:
 def floating(height: Array, t: Array) -> float:
     """s, the longest time during which no foot (T, F) is near the ground."""
     longest, since = 0.0, None
-    for time, aloft in zip(t.tolist(), (height > NEAR).all(1).tolist(), strict=True):
-        since = (time if since is None else since) if aloft else None
-        longest = max(longest, float(time - since) if since is not None else 0.0)
+    for time, foot in zip(t.tolist(), height.min(1).tolist(), strict=True):
+        since = (time if since is None else since) if foot > NEAR else None
+        longest = max(longest, time - since if since is not None else 0.0)
     return longest
 
 

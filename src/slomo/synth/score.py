@@ -40,6 +40,15 @@ def _swapped(X: np.ndarray, Y: np.ndarray, names: list[str], feet: list[str]) ->
     return out
 
 
+def _slide(placed: np.ndarray, names: list[str], truth: Mapping[str, Any], fps: float) -> float | None:
+    stands = np.asarray(truth["foot_contact"], bool)
+    feet = [(k, names.index(n)) for k, n in enumerate(map(str, truth["foot_names"])) if n in names]
+    speed = np.linalg.norm(np.gradient(placed[..., :2], 1 / fps, axis=0), axis=-1)
+    slid = np.concatenate([speed[stands[:, k], i] for k, i in feet]) if feet else np.zeros(0)
+    slid = slid[np.isfinite(slid)]
+    return float(slid.mean()) if len(slid) else None
+
+
 def score(motion: KeypointMotion, truth: Mapping[str, Any]) -> dict[str, Any]:
     """Compare key points with the arrays of a `truth.npz`; names that both have count.
 
@@ -49,6 +58,7 @@ def score(motion: KeypointMotion, truth: Mapping[str, Any]) -> dict[str, Any]:
         foot_mpjpe_percent: the same, of the feet.
         root_path_error_percent: mean distance of the root (same alignment), in per cent of the distance that it
             travelled; None for a subject that stays within half its length.
+        foot_slide_mps: mean horizontal speed of the feet (same alignment) while the true ones stand; None if none does.
         swapped: feet "front_left_paw" etc. of the pairs that lie nearer, over the whole motion, to each other's truth.
         gravity_error_degrees: angle between the two verticals in that alignment.
         matched: number of common key points.  coverage: part of the true frames with at least four of them.
@@ -92,6 +102,7 @@ def score(motion: KeypointMotion, truth: Mapping[str, Any]) -> dict[str, Any]:
         w_mpjpe_percent=float(np.nanmean(error) * percent),
         foot_mpjpe_percent=float(np.nanmean(error[:, feet]) * percent) if feet else None,
         root_path_error_percent=path_error,
+        foot_slide_mps=_slide(placed, names, truth, fps),
         swapped=_swapped(placed, Y, names, [str(n) for n in truth["foot_names"]]),
         gravity_error_degrees=float(np.degrees(np.arccos(np.clip(R[2, 2], -1, 1)))),
         matched=len(names),
