@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from slomo.cli.session import RobotOption, Session, command
+from slomo.cli.subject import AtOption, BoxOption, chosen_subject
 from slomo.errors import UsageError
 
 SkeletonOption = Annotated[
@@ -15,14 +16,6 @@ SegmenterOption = Annotated[
     str | None, typer.Option("--segmenter", metavar="auto|u2netp|motion|user", help="How the subject is found.")
 ]
 MasksOption = Annotated[Path | None, typer.Option("--masks", metavar="DIR", help="Your own masks, one image a frame.")]
-AtOption = Annotated[
-    str | None,
-    typer.Option("--subject-at", metavar="U,V[,S]|none", help="Of several, the one at this pixel (at this second)."),
-]
-BoxOption = Annotated[
-    str | None,
-    typer.Option("--subject-box", metavar="U0,V0,U1,V1[,S]|none", help="Of several, the one in this box of pixels."),
-]
 WeightsOption = Annotated[Path | None, typer.Option("--weights", help="U2-Net-p weights (.onnx).")]
 StartOption = Annotated[float | None, typer.Option("--start", help="First second of the clip to use.")]
 DurationOption = Annotated[float | None, typer.Option("--duration", help="Seconds to use; 0: all.")]
@@ -95,9 +88,8 @@ def _evidence(
 def _from_clip(
     session: Session,
     skeleton: str | None,
-    segmenter: str | None,
+    who: dict[str, Any],
     masks: Path | None,
-    subject: dict[str, Any],
     weights: Path | None,
     start: float | None,
     duration: float | None,
@@ -113,27 +105,11 @@ def _from_clip(
     changes["inputs"] = changes.get("inputs", {}) | inputs | evidence["inputs"]
     changes["evidence"] = evidence["evidence"]
     changes["decode"] = _given(start=start, duration=duration)
-    changes["masks"] = _given(segmenter=segmenter) | subject
-    if masks is not None and segmenter is None:
-        changes["masks"]["segmenter"] = None  # the default takes the masks that are given
+    changes["masks"] = who
+    if masks is not None:
+        changes["masks"].setdefault("segmenter", None)  # the default takes the masks that are given
     changes["camera"] = _given(fov_deg=fov)
     changes["reconstruct"] = changes.get("reconstruct", {}) | _given(length_m=length, quality=quality)
-    return changes
-
-
-def _subject(at: str | None, box: str | None) -> dict[str, Any]:
-    """Whom the user means, as parameters of the masks. "none" goes back to the largest; the one unsets the other."""
-    given = {"subject_at": at, "subject_box": box}
-    wanted = {name: text for name, text in given.items() if text not in (None, "none")}
-    if len(wanted) == 2:
-        raise UsageError("a point and a box are given", where="--subject-at, --subject-box", todo="give one of them")
-    changes: dict[str, Any] = dict.fromkeys(given) if wanted else {n: None for n, text in given.items() if text}
-    for name, text in wanted.items():
-        try:
-            changes[name] = [float(x) for x in str(text).split(",")]
-        except ValueError:
-            where = "--" + name.replace("_", "-")
-            raise UsageError(f"{text!r} is no list of numbers", where=where, valid=["for example 320,180"]) from None
     return changes
 
 
@@ -176,20 +152,8 @@ def add_commands(app: typer.Typer) -> None:
         slomo reconstruct cat.mp4 --prior none --keypoints2d points.json
         """
         evidence = _evidence(session, prior, keypoints2d, keypoint_model, keypoint_map)
-        changes = _from_clip(
-            session,
-            skeleton,
-            segmenter,
-            masks,
-            _subject(subject_at, subject_box),
-            weights,
-            start,
-            duration,
-            length,
-            quality,
-            fov,
-            evidence,
-        )
+        who = chosen_subject(segmenter, subject_at, subject_box)
+        changes = _from_clip(session, skeleton, who, masks, weights, start, duration, length, quality, fov, evidence)
         if clip is not None:
             changes["inputs"] |= {"clip": session.user_path(clip, "clip")} | session.choice_reopened("clip")
         project = session.configure(changes)
@@ -306,20 +270,8 @@ def add_commands(app: typer.Typer) -> None:
         slomo run cat00.json --robot go1
         """
         evidence = _evidence(session, prior, keypoints2d, keypoint_model, keypoint_map)
-        changes = _from_clip(
-            session,
-            skeleton,
-            segmenter,
-            masks,
-            _subject(subject_at, subject_box),
-            weights,
-            start,
-            duration,
-            length,
-            quality,
-            fov,
-            evidence,
-        )
+        who = chosen_subject(segmenter, subject_at, subject_box)
+        changes = _from_clip(session, skeleton, who, masks, weights, start, duration, length, quality, fov, evidence)
         inputs = changes["inputs"]
         inputs |= _truth(session, truth)
         if source is not None:
