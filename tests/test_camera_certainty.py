@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slomo.reconstruct import certainty, sfm
+from slomo.reconstruct import certainty, resection, sfm
 from slomo.reconstruct.camera import _key_frames, estimate_camera
 from slomo.reconstruct.tracks import Tracks
 from slomo.stage import Silent
@@ -183,6 +183,18 @@ def test_structure_is_not_made_twice(monkeypatch):
     assert path.report["key_frames_registered"] == path.report["key_frames"] == 16
     assert path.report["fallback"] is None
     assert 0 < path.report["focal_std_px"] < 300
+
+
+def test_frames_that_structure_from_motion_does_not_reach_are_named(monkeypatch):
+    frames = layers(45)
+    keys = np.array([*range(0, 45, 3), 44])
+    s = structure(0.3, cameras=len(keys))
+    made = sfm.Structure(keys, s.T_world_cam, 300.0, s.points, s.observations, s.xy, 0.3, 1.5)
+    path = np.repeat(s.T_world_cam, 3, 0)[:45]
+    monkeypatch.setattr(sfm, "reconstruct_structure", lambda *a, **k: made)
+    monkeypatch.setattr(resection, "camera_path", lambda *a: (path, np.arange(45) < 40))
+    found = estimate_camera(frames, np.zeros(frames.shape[:3], bool), np.arange(45) / 30, settings(300.0), Silent())
+    assert found.report["fallback"] == "the camera of 5 of 45 frames is interpolated"
 
 
 def test_featureless_background_is_said():

@@ -22,6 +22,7 @@ _PARALLAX_PX = 0.5  # px, residual of the turning camera over a second and more,
 _LEAST_CORNERS = 12  # in a frame, in the median, below which the background says nothing about the camera
 _MOST_KEYS = 120  # key frames that are enough for any clip, as long as none is farther from the next than this:
 _KEY_GAP = 0.5  # s
+_MOST_GUESSED = 0.05  # part of the frames whose camera may be interpolated without a word
 _MOST_PAIRS = 24_000  # correspondences for a turning camera, drawn from those there are
 
 
@@ -77,7 +78,11 @@ def estimate_camera(
             )
             report["focal_observed"] = settings.refine_focal
             std = certainty.focal_std(structure, center) if settings.refine_focal else settings.focal_std
-            return moving(frames, masks, structure, std, center, report)
+            path = moving(frames, masks, structure, std, center, report)
+            if (guessed := len(frames) - path.report["frames_measured"]) > _MOST_GUESSED * len(frames):
+                path.report["fallback"] = f"the camera of {guessed} of {len(frames)} frames is interpolated"
+                progress.note(f"camera: {path.report['fallback']}: structure from motion does not reach them")
+            return path
         report["fallback"] = (
             f"structure from motion placed {report['key_frames_registered']} of {report['key_frames']} key frames"
         )

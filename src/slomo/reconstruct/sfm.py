@@ -29,8 +29,8 @@ ENOUGH = 0.6  # part of the key frames that a model must hold to be used
 # clip that turns more than it travels has no points left at those.
 _ANGLES = ((16.0, 1.5), (4.0, 0.4))
 _ENOUGH_POINTS = 10  # points for each key frame, below which the next angles are tried
-_MAX_SECONDS = 90  # of a mapping, and at least
-_MAX_SECONDS_EACH = 2.0  # for each key frame
+# Seconds of a mapping at most, by the clock: a net for one that does not end, which a busy machine must not run into.
+_MAX_SECONDS, _MAX_SECONDS_EACH = 180, 8.0  # at least, and for each key frame
 
 
 @dataclass(frozen=True)
