@@ -27,6 +27,7 @@ Tensor = torch.Tensor
 POSE = ("Q", "G")
 FIELDS = "F."
 PHYSICS, NOW = "physics.", "now."  # prefixes in a checkpoint: the physics' state; variables within a step
+SURFACE = 6.0  # weight of the opacity while the pose is held, over that beside it: masks say more of skin than of bones
 WORSE = 0.02  # a step is undone when the loss of the coarse fit's own terms rises by more than this share
 
 
@@ -117,7 +118,8 @@ def _step(
     terms = dict(problem.terms)
     own = fields.terms() if fields else {}
     if name == "appearance":
-        return replace(problem, terms=own), Schedule(plan.appearance, 48, 300, (FIELDS,)), {}
+        weights = {**problem.weights, "opacity": SURFACE * problem.weights.get("opacity", 0.0)}
+        return replace(problem, terms=own, weights=weights), Schedule(plan.appearance, 48, 300, (FIELDS,)), {}
     if name == "fields":
         learn = (*POSE, FIELDS)
         return replace(problem, terms=terms | own), Schedule(plan.joint, 48, 300, learn, rate=plan.rate), {}

@@ -21,7 +21,7 @@ from slomo.reconstruct.run import Run, from_arrays
 from slomo.reconstruct.verdict import Facts, checks, verdict
 from slomo.stage import Artifact, Inputs, Progress
 
-REFINE_VERSION = 5
+REFINE_VERSION = 6
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class ReconstructConfig(FitConfig):
     fields: bool = True
     physics: bool = True
     weight_colour: float = 0.3
-    weight_opacity: float = 0.3
+    weight_opacity: float = 0.05
     weight_field_flow: float = 0.3
     weight_eikonal: float = 0.05
     weight_cycle: float = 0.01
@@ -56,7 +56,7 @@ class ReconstructConfig(FitConfig):
 
 PLANS = {
     "draft": Plan(None, None),
-    "normal": Plan(FieldsConfig(), PhysicsConfig(), appearance=100, joint=300, rounds=2, render=60),
+    "normal": Plan(FieldsConfig(), PhysicsConfig(), appearance=100, joint=200, rounds=2, render=60),
     "high": Plan(FieldsConfig(), PhysicsConfig(), appearance=200, joint=900, rounds=4, render=100),
 }
 
