@@ -30,7 +30,9 @@ def kinematic(T: int = 25, fps: float = 30.0, *, speed: float = 0.0, sunk: float
 
 
 def learner(k: Kinematic, **config) -> Learner:
-    body = build(SKELETON, SKELETON.offset * LENGTH, SKELETON.capsule_radii * LENGTH, length=LENGTH)
+    kin = Kinematics(SKELETON)
+    still = torch.zeros(1, 1, 3), torch.eye(3)[None, None], torch.zeros(1, 1, kin.B, 3)
+    body = build(SKELETON, kin.pose(kin.shape_variables(1), *still), unit=LENGTH)
     return Learner(body, k, SKELETON.mirror[: SKELETON.link_count], PhysicsConfig(**config))
 
 

@@ -73,15 +73,11 @@ class Physics:
         """The mechanical body of the fitted shape, the fitted motion at every frame, and metres per world unit."""
         problem, skeleton = self.problem, self.problem.kin.skeleton
         shape = {k.removeprefix("shape."): v.detach() for k, v in x.items() if k.startswith("shape.")}
-        length = shape["log_length"].exp()
-        offset = problem.kin.offsets(shape)
         # With the feet held where they stand: feet that slide cannot be followed.
         posed, stands, q = stood(problem, x, guess)
         unit = self.metres / own_length(problem, shape)
         f = lambda v: v[0].numpy().astype(float)  # noqa: E731
-        body = build(
-            skeleton, f(offset) * unit, f(posed.radii) * unit, length=float(length[0]) * unit, mechanics=self.mechanics
-        )
+        body = build(skeleton, posed, unit=unit, mechanics=self.mechanics)
         t = problem.obs.t.numpy().astype(float)
         nodes = f(posed.nodes)
         contact = np.zeros(nodes.shape[:2])

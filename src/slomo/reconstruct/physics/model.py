@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slomo.flesh import Cone
+from slomo.reconstruct.kinematics import Posed
 from slomo.skeleton import Skeleton
 
 Array = np.ndarray
@@ -107,18 +108,15 @@ def solid(cones: Sequence[Cone], links: int, *, cell: float) -> tuple[Array, Arr
     return total(np.ones(len(x))), first, second
 
 
-def build(
-    skeleton: Skeleton, offset: Array, radii: Array, *, length: float, mechanics: Mechanics | None = None
-) -> Body:
-    """Body of a skeleton with a fitted shape.
-
-    Args:
-        offset: (M, 3) m of the nodes (`Kinematics.offsets` in metres). radii: (C, 2) m of the capsules.
-        length: m, the body length of the shape variables (`exp(log_length)` in metres).
-    """
+def build(skeleton: Skeleton, posed: Posed, *, unit: float, mechanics: Mechanics | None = None) -> Body:
+    """The mechanical body of a posed one (its first hypothesis; the pose does not matter). unit: m per unit of it."""
     B, link = skeleton.link_count, skeleton.link
-    own = skeleton.capsule_nodes == skeleton.capsule_link[:, None]
-    ends = np.where(own[..., None], 0.0, offset[skeleton.capsule_nodes]) + skeleton.capsule_shift * length
+    p, R = (v[0, 0].numpy().astype(float) for v in (posed.nodes, posed.R))
+    length, radii = float(posed.length[0]) * unit, posed.radii[0].numpy().astype(float) * unit
+    inside = lambda x, i: np.einsum("cba,cb->ca", R[i], x - p[i]) * unit  # noqa: E731
+    offset = np.concatenate([np.zeros((1, 3)), inside(p[1:], link[1:])])
+    capsules = [v[0, 0].numpy().astype(float) for v in (posed.a, posed.b)]
+    ends = np.stack([inside(x, skeleton.capsule_link) for x in capsules], 1)
     rest = np.zeros_like(offset)
     for m in range(1, len(rest)):
         rest[m] = rest[link[m]] + offset[m]
