@@ -5,7 +5,9 @@ import numpy as np
 from slomo.reconstruct.sfm import Structure
 
 _MOST_CAMERAS, _MOST_POINTS = 120, 1200  # that the focal length's certainty is computed from, about
-_DEPENDENT = 10.0  # observations of one point are not independent: counted as if a tenth of them were there
+# Observations are not independent, and the model (no distortion, no rolling shutter) is not exact: counted as if a
+# hundredth of them were there, which is what errors of rendered clips ask for (1 to 6 px, where that says 1 to 3).
+_DEPENDENT = 100.0
 _BLOCKS = 8
 
 
