@@ -18,7 +18,8 @@ from slomo.stage import Artifact, Inputs, Progress
 
 Array = np.ndarray
 
-VERSION = 3
+VERSION = 4
+MOST_FRAMES = 600  # that are looked at: each takes 3 MB, and long clips are not to take more than others
 
 PRIORS = ("auto", "none")
 
@@ -135,12 +136,12 @@ def _name(prior: Prior, known: Labels) -> str:
 
 
 def _shots(inputs: Inputs, fps: float) -> Shots:
-    """The frames to look at: every n-th, those without a subject left out."""
+    """The frames to look at: every n-th, fewer of a long clip, those without a subject left out."""
     decode, masks = inputs.artifacts["decode"].npz["frames.npz"], inputs.artifacts["masks"].npz
     packed = masks["masks.npz"]
     t = np.asarray(decode["t"], float)
     full = np.unpackbits(packed["packed"], axis=-1)[..., : int(packed["shape"][2])].astype(bool)
-    index = np.arange(0, len(t), every(t, fps))
+    index = np.arange(0, len(t), max(every(t, fps), -(-len(t) // MOST_FRAMES)))
     index = index[full[index].any((1, 2))]
     return Shots(
         index=index,
