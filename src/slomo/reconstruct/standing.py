@@ -69,7 +69,8 @@ def stances(down: Array) -> list[tuple[int, int]]:
 
 def places(feet: Array, contact: Array, t: Array, ground: float) -> Array:
     """(T, F, 3) where the feet go: through each stance at its mean place, `ground` high; in between the correction
-    changes evenly from one stance's to the next one's. A foot that never stands stays as it is."""
+    changes evenly from one stance's to the next one's, but the foot is never below the ground. A foot that never stands
+    stays as it is."""
     out = feet.copy()
     for f in range(feet.shape[1]):
         moves = np.full((len(t), 3), np.nan)
@@ -80,6 +81,7 @@ def places(feet: Array, contact: Array, t: Array, ground: float) -> Array:
         known = np.flatnonzero(np.isfinite(moves[:, 0]))
         if len(known):
             out[:, f] += np.stack([np.interp(t, t[known], moves[known, c]) for c in range(3)], 1)
+            out[:, f, 2] = np.maximum(out[:, f, 2], ground)
     return out
 
 

@@ -57,7 +57,7 @@ class Simulated:
 
     Attributes:
         nodes: (T, M, 3) m. force: (T, F, 3) N of the ground on each foot, mean over the time from moment to moment.
-        trust: (T,) in [0, 1], 0 where the simulation did not follow (it fell, or is not finite).
+        trust: (T,) in [0, 1], 0 where the simulation did not follow (it fell, is not finite, or is just far off).
         report: figures for the eye.
     """
 
@@ -186,7 +186,8 @@ class Learner:
         w, body, T = self.windows, self.body, len(self.kinematic.t)
         here = w.frame >= 0
         mean = np.array([np.nanmean(np.where(np.isfinite(e[h]), e[h], 9.0)) for e, h in zip(error, here, strict=True)])
-        good = mean < LOST
+        trust = np.clip((LOST - mean) / (LOST - FOLLOWED), 0, 1)
+        good = trust > 0
         feet = np.flatnonzero(body.contact_node >= 0)
         feet = feet[np.argsort(body.contact_node[feet])]
         force = np.nan_to_num(seen.force[:, :, feet])
@@ -206,11 +207,13 @@ class Learner:
             if good.any()
             else None,
         }
-        trust = w.merge(np.broadcast_to(good[:, None].astype(float), w.frame.shape), T)
-        return Simulated(w.merge(safe, T), w.merge(force, T), trust, report)
+        shared = w.merge(np.broadcast_to(trust[:, None], w.frame.shape), T)
+        return Simulated(w.merge(safe, T), w.merge(force, T), shared, report)
 
 
-LOST = 0.15  # body lengths: a window whose nodes are that far from the kinematic ones on average did not follow
+# Mean distance of a window's nodes from the kinematic ones, body lengths: up to the first it followed, from the second
+# on it is not trusted at all.
+FOLLOWED, LOST = 0.01, 0.03
 
 
 def _tame(x: Variables) -> None:
