@@ -85,8 +85,9 @@ def test_learning_makes_the_body_stand_where_it_should():
 def test_what_no_body_can_do_is_not_done():
     """A body that glides on feet that stand: friction holds the feet, which slide in the kinematic motion."""
     one = learner(kinematic(speed=0.1))
-    feet = one.simulate(one.start(), 0.001).nodes[3:, list(SKELETON.contacts), :2]
-    assert np.linalg.norm(np.diff(feet, axis=0), axis=-1).mean() * 30 < 0.2 * 0.1
+    nodes = one.roll(one.controls(one.start(), 0.001)).numpy()
+    first = nodes[0, 3:, list(SKELETON.contacts), :2]  # the first window, once the feet are down
+    assert np.linalg.norm(np.diff(first, axis=1), axis=-1).mean() * 30 < 0.2 * 0.1
 
 
 def test_learning_is_deterministic_and_goes_on_from_plain_arrays():
