@@ -2,18 +2,19 @@
 # make test   unit tests and an end-to-end smoke test     make check  ruff and pyright
 # make train-prior   pictures, then the networks of src/slomo/prior/weights, from nothing: within the hour on two cores
 # make bench-prior   those networks alone against truth      (WEIGHTS=folder: others; BENCH="--truth ... --masks ...")
+# make bench-parts   reconstruction without each of its parts
 # make bench-terms   reconstruction with and without each term of the prior   (BENCH="--seeds 5 --terms some")
 PYTHON ?= python3
 ROBOT  ?= go1
 DEMO   := demo
 CLIP   := src/slomo/assets/walk
 KINDS  := quadruped human
-STEPS_quadruped := 5500
+STEPS_quadruped := 8500
 STEPS_human     := 4000
 PRIOR  := prior-training
 SHIPPED := src/slomo/prior/weights
 
-.PHONY: demo test slow check clean train-prior bench-prior bench-terms $(KINDS:%=train-%)
+.PHONY: demo test slow check clean train-prior bench-prior bench-terms bench-parts $(KINDS:%=train-%)
 .DELETE_ON_ERROR:
 
 demo: .venv/run.stamp
@@ -46,6 +47,9 @@ bench-prior: .venv/dev.stamp
 
 bench-terms: .venv/dev.stamp
 	.venv/bin/python tests/bench_terms.py bench $(BENCH)
+
+bench-parts: .venv/dev.stamp
+	.venv/bin/python tests/bench_terms.py bench --terms parts $(BENCH)
 
 .venv/run.stamp: pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "slomo needs Python 3.11 or newer: make PYTHON=python3.11")'
