@@ -1,13 +1,15 @@
 """The parts of the fit: kinematics, projection, distances, flow, hypotheses."""
 
 import math
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from slomo.reconstruct import hypotheses, silhouette
+from slomo.reconstruct import hypotheses, losses, silhouette
 from slomo.reconstruct.hypotheses import GaitHypothesis
 from slomo.reconstruct.kinematics import Kinematics, joint_rotation
 from slomo.reconstruct.silhouette import Intrinsics, Outline
@@ -41,9 +43,15 @@ def test_mirrored_angles_give_the_mirrored_body(kin: Kinematics):
     shape = {k: torch.randn(v.shape, generator=generator) for k, v in kin.shape_variables(1).items()}
     other = torch.as_tensor(kin.skeleton.mirror[: kin.B])
     mirrored = q[:, :, other] * torch.tensor([-1.0, 1.0, -1.0])
-    a = _posed(kin, q, torch.eye(3), shape).nodes[0, 0].numpy()
-    b = _posed(kin, mirrored, torch.eye(3), shape).nodes[0, 0].numpy()
+    one, two = _posed(kin, q, torch.eye(3), shape), _posed(kin, mirrored, torch.eye(3), shape)
+    a, b = one.nodes[0, 0].numpy(), two.nodes[0, 0].numpy()
     np.testing.assert_allclose(b[kin.skeleton.mirror] * [1, -1, 1], a, atol=1e-5)
+    # The flesh too; a capsule that goes from left to right is its own mirror image with its ends exchanged.
+    other = kin.skeleton.capsule_mirror
+    pairs = other != np.arange(len(other))
+    for end in ("a", "b"):
+        flesh, image = getattr(one, end)[0, 0].numpy(), getattr(two, end)[0, 0].numpy()
+        np.testing.assert_allclose(image[other][pairs] * [1, -1, 1], flesh[pairs], atol=1e-5)
 
 
 def test_bones_keep_their_lengths(kin: Kinematics):
@@ -52,6 +60,17 @@ def test_bones_keep_their_lengths(kin: Kinematics):
     link = kin.skeleton.link
     lengths = np.linalg.norm(x[:, 1:] - x[:, link[1:]], axis=-1)
     np.testing.assert_allclose(lengths, np.tile(np.linalg.norm(kin.skeleton.offset[1:], axis=1), (5, 1)), atol=1e-5)
+
+
+def test_a_body_beside_its_feet_is_out_of_balance(kin: Kinematics):
+    q = torch.zeros(2, 3, kin.B, 3)
+    legs = [limb.swing for limb in kin.skeleton.limbs]
+    q[1, :, legs, 0] = 0.15  # all legs to the same side
+    body = _posed(kin, q, torch.eye(3))
+    state = cast(losses.State, SimpleNamespace(body=body, kin=kin, R_root=torch.eye(3).expand(2, 3, 3, 3)))
+    straight, leaning = losses.balance(state).tolist()
+    assert straight == pytest.approx(0, abs=1e-6)
+    assert leaning > 1
 
 
 def _random_outline(generator: torch.Generator) -> list[torch.Tensor]:

@@ -21,10 +21,10 @@ from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import Skeleton, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 5
+FIT_VERSION = 6
 
 # Of the heading, gait, rivals and final phase.
-ITERATIONS = {"draft": (60, 60, 80, 250), "normal": (100, 120, 150, 700), "high": (150, 200, 300, 1400)}
+ITERATIONS = {"draft": (60, 60, 80, 250), "normal": (100, 120, 150, 1000), "high": (150, 200, 300, 1400)}
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class FitConfig:
     length_m: float = 0.0
     seed: int = 0
     fps: float = 15.0
-    subject_px: float = 42.0
+    subject_px: float = 56.0
     width: int = 64
     joint_hz: float = 4.0
     root_hz: float = 2.5
@@ -67,6 +67,7 @@ class FitConfig:
     weight_limits: float = 0.05
     weight_smooth: float = 0.04
     weight_forward: float = 0.25
+    weight_balance: float = 0.01
     weight_prior: float = 0.05
     weight_facing: float = 0.05
     weight_view: float = 0.05
@@ -180,12 +181,13 @@ def one_thread() -> Iterator[None]:
 
 def _effort(config: FitConfig) -> fitting.Effort:
     heading, gait, rivals, final = config.iterations or ITERATIONS[config.quality]
+    skeleton = tuple(f"shape.{k}" for k in ("log_length", "group", "node", "shift", "radius", "girth"))
     return fitting.Effort(
         schedules=(
             Schedule(heading, 12, 160, ("G", "shape.log_length", "shape.group", "shape.girth")),
-            Schedule(gait, 16, 160, ("Q", "G", "shape", "tilt"), stance=1.0),
-            Schedule(rivals, 32, 200, ("Q", "G", "shape", "tilt"), stance=0.0),
-            Schedule(final, 48, 300, ("Q", "G", "shape", "tilt")),
+            Schedule(gait, 16, 160, (*skeleton, "Q", "G", "tilt"), stance=1.0),
+            Schedule(rivals, 32, 200, (*skeleton, "Q", "G", "tilt"), stance=0.0),
+            Schedule(final, 48, 300, (*skeleton, "Q", "G", "tilt"), late=("shape.flesh",)),
         ),
         candidates=config.candidates,
         phases_of_gait=config.gait_phases,

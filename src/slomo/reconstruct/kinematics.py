@@ -11,9 +11,12 @@ from slomo.skeleton import Skeleton
 
 Tensor = torch.Tensor
 
-NODE_SPREAD = 0.08  # s.d. of the log length of one offset, beside its group's
-SHIFT_SPREAD = 0.025  # s.d. of the place of a node, body lengths
-RADIUS_SPREAD = 0.18  # s.d. of the log radius of one capsule
+# Animals differ in where their joints lie in the flesh by more than in their outline, so both are free: motion tells
+# where a limb turns, the silhouette where its flesh ends.
+NODE_SPREAD = 0.16  # s.d. of the log length of one offset, beside its group's
+SHIFT_SPREAD = 0.05  # s.d. of the place of a node, body lengths
+RADIUS_SPREAD = 0.18  # s.d. of the log radius of one end of a capsule
+FLESH_SPREAD = 0.03  # s.d. of the place of one end of a capsule against its node, body lengths
 GIRTH_SPREAD = 0.15  # s.d. of the log of all radii together
 
 
@@ -79,7 +82,10 @@ class Kinematics:
         self.flip = torch.where(first < torch.arange(len(first)), -1.0, 1.0)
         self.median = (self.mirror == torch.arange(len(first))).float()
         c_first = torch.minimum(i(skeleton.capsule_mirror), torch.arange(len(self.c_link)))
-        self.radius_variable = torch.unique(c_first, return_inverse=True)[1]
+        self.flesh_variable = torch.unique(c_first, return_inverse=True)[1]
+        c_number = torch.arange(len(c_first))
+        sideways = torch.where(c_first < c_number, -1.0, 1.0) * (i(skeleton.capsule_mirror) != c_number)
+        self.flesh_side = torch.stack([torch.ones_like(sideways), sideways, torch.ones_like(sideways)], -1)[:, None]
         depth = [0]
         for j in range(1, self.B):
             depth.append(depth[int(self.link[j])] + 1)
@@ -88,8 +94,9 @@ class Kinematics:
 
     def shape_variables(self, H: int) -> dict[str, Tensor]:
         """Zeros of every shape variable: the skeleton as written, one unit long."""
-        n, c = int(self.node_variable.max()) + 1, int(self.radius_variable.max()) + 1
-        sizes = dict(log_length=(), group=(len(self.group_spread),), node=(n,), shift=(n, 3), radius=(c,), girth=())
+        n, c = int(self.node_variable.max()) + 1, int(self.flesh_variable.max()) + 1
+        skeleton = dict(log_length=(), group=(len(self.group_spread),), node=(n,), shift=(n, 3))
+        sizes = skeleton | dict(flesh=(c, 2, 3), radius=(c, 2), girth=())
         return {k: torch.zeros(H, *s) for k, s in sizes.items()}
 
     def offsets(self, shape: dict[str, Tensor]) -> Tensor:
@@ -100,6 +107,13 @@ class Kinematics:
         offset = self.offset * log.exp()[..., None] + shift * side
         offset = torch.cat([torch.zeros_like(offset[:, :1]), offset[:, 1:]], 1)
         return offset * shape["log_length"].exp()[:, None, None]
+
+    def capsule_ends(self, shape: dict[str, Tensor], offset: Tensor) -> Tensor:
+        """(H, C, 2, 3) ends of the capsules in their links, world units. offset (H, M, 3): as `offsets` gives them."""
+        # Nothing for the link's own node, the offset for a node fixed to it.
+        ends = torch.where(self.c_own[None, :, :, None], torch.zeros(1), offset[:, self.c_nodes])
+        flesh = self.c_shift + FLESH_SPREAD * shape["flesh"][:, self.flesh_variable] * self.flesh_side
+        return ends + flesh * shape["log_length"].exp()[:, None, None, None]
 
     def pose(self, shape: dict[str, Tensor], position: Tensor, R_root: Tensor, q: Tensor) -> Posed:
         """Forward kinematics. position (H, T, 3), R_root (H, T, 3, 3), q (H, T, B, 3) rad with an unused root row."""
@@ -120,11 +134,9 @@ class Kinematics:
         points = self.link[self.B :]
         tips = ps[:, :, points] + (Rs[:, :, points] @ offset[:, None, self.B :, :, None])[..., 0]
         length = shape["log_length"].exp()
-        # Ends of the capsules in their link: nothing for the link's own node, the offset for a node fixed to it.
-        ends = torch.where(self.c_own[None, :, :, None], torch.zeros(1), offset[:, self.c_nodes])
-        ends = ends + self.c_shift * length[:, None, None, None]
+        ends = self.capsule_ends(shape, offset)
         Rc, pc = Rs[:, :, self.c_link], ps[:, :, self.c_link]
         ab = pc[:, :, :, None] + (Rc[:, :, :, None] @ ends[:, None, ..., None])[..., 0]
-        log_r = GIRTH_SPREAD * shape["girth"][:, None] + RADIUS_SPREAD * shape["radius"][:, self.radius_variable]
-        radii = self.c_radii * (log_r.exp() * length[:, None])[..., None]
+        log_r = GIRTH_SPREAD * shape["girth"][:, None, None] + RADIUS_SPREAD * shape["radius"][:, self.flesh_variable]
+        radii = self.c_radii * log_r.exp() * length[:, None, None]
         return Posed(torch.cat([ps, tips], 2), Rs, ab[..., 0, :], ab[..., 1, :], radii, length.expand(H))

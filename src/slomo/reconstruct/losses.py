@@ -17,6 +17,7 @@ from slomo.reconstruct.silhouette import Outline
 Tensor = torch.Tensor
 
 SOFT_PX = 0.7  # width of the silhouette's edge and of the smooth minimum over capsules, working pixels
+SWING = 3.0  # accelerations of a gait's nodes in units of speed squared over body length
 FLOW_PX = 0.25  # flow errors below this are noise, working pixels
 
 
@@ -235,14 +236,36 @@ def facing(s: State) -> Tensor:
 
 
 def smooth(s: State) -> Tensor:
-    """Accelerations of all nodes, and of the root twice, in units of 15 body lengths / s^2."""
-    x = s.body.nodes
+    """Accelerations of all nodes, and of the root twice, in units of 15 body lengths / s^2.
+
+    A body that travels at v swings its legs with accelerations of the order of v^2 / body length (to gravity they are
+    as Froude's number), so the unit grows with that: a gallop is not smoothed into a walk.
+    """
+    x, length = s.body.nodes, s.body.length[:, None, None, None]
     if x.shape[1] < 3:
         return x.new_zeros(len(x))
     dt = s.obs.dt
-    v = (x[:, 1:] - x[:, :-1]) / dt[:, None, None]
-    a = (v[:, 1:] - v[:, :-1]) / (0.5 * (dt[1:] + dt[:-1]))[:, None, None] / s.body.length[:, None, None, None]
-    return ((a / 15).square().sum(-1).mean(2) + (a[:, :, 0] / 8).square().sum(-1)).mean(1)
+    v = (x[:, 1:] - x[:, :-1]) / dt[:, None, None] / length
+    a = (v[:, 1:] - v[:, :-1]) / (0.5 * (dt[1:] + dt[:-1]))[:, None, None]
+    travel = v[:, :, 0, :2].norm(dim=-1).mean(1).detach()
+    a = a / torch.sqrt(15**2 + (SWING * travel**2) ** 2)[:, None, None, None]
+    return (a.square().sum(-1).mean(2) + (15 / 8) ** 2 * a[:, :, 0].square().sum(-1)).mean(1)
+
+
+def balance(s: State) -> Tensor:
+    """Over the clip a body is above its feet, not beside them: its centre of mass against the middle of the feet,
+    across the way it faces, in units of 0.03 body lengths. A camera at the side sees none of it: all of it is depth.
+    """
+    body = s.body
+    with torch.no_grad():
+        r = body.radii.mean(-1)[:, None]
+        volume = r.square() * ((body.b - body.a).norm(dim=-1) + 4 / 3 * r)
+        volume = (volume / volume.sum(-1, keepdim=True))[..., None]
+    off = ((body.a + body.b) / 2 * volume).sum(2) - body.nodes[:, :, s.kin.contacts].mean(2)
+    ahead = torch.nn.functional.normalize(s.R_root[..., :2, 0], dim=-1)
+    across = (off[..., 1] * ahead[..., 0] - off[..., 0] * ahead[..., 1]).mean(1) / body.length
+    e = (across / 0.03).square()
+    return e / (1 + 0.1 * e)
 
 
 def prior(s: State) -> Tensor:
@@ -253,5 +276,5 @@ def prior(s: State) -> Tensor:
 
 TERMS: dict[str, Term] = {
     "mask": mask, "reach": reach, "flow": flow, "stance": stance, "ground": ground, "limits": limits, "smooth": smooth,
-    "forward": forward, "prior": prior, "facing": facing,
+    "forward": forward, "balance": balance, "prior": prior, "facing": facing,
 }  # fmt: skip

@@ -100,16 +100,18 @@ class Problem:
         return sum((self.weights[k] * v for k, v in parts.items()), torch.zeros(len(guess.yaw))), parts
 
 
+LATE = 0.3  # the part of a phase in which the late variables change
 RATES = {"shape.log_length": 4e-3, "shape": 3e-2, "tilt": 2e-2, "Q": 4e-3, "G": 2e-3, "F": 4e-3, "F.background": 1e-2}
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """One phase of optimisation: Adam, cosine decay of the rates to a tenth.
+    """One phase of optimisation: Adam, cosine decay of the rates to a tenth; once more from the start for what is late.
 
     Attributes:
         iterations; frames and pixels of each draw; learn: prefixes of the variables that change.
         stance: weight of the hypothetical contacts at the start; it falls to 0 at two thirds.
+        late: prefixes of the variables that change too, but in the last part only (`LATE` of the phase).
         rate: factor of every variable's rate.
     """
 
@@ -118,6 +120,7 @@ class Schedule:
     pixels: int
     learn: tuple[str, ...]
     stance: float = 0.0
+    late: tuple[str, ...] = ()
     rate: float = 1.0
 
 
@@ -144,15 +147,18 @@ def optimise(
 
     Hypotheses share nothing, so the sum of their losses is minimised.
     """
-    optimiser = adam(x, schedule.learn)
+    optimiser = adam(x, schedule.learn + schedule.late)
+    late = [k.startswith(schedule.late) for k in x if k.startswith(schedule.learn + schedule.late)]
+    early = schedule.iterations - round(LATE * schedule.iterations) if schedule.late else schedule.iterations
     if adam_state is not None:
         optimiser.load_state_dict(optimiser.state_dict() | {"state": adam_state})
     n = schedule.iterations
     for i in range(start, n):
-        decay = 0.1 + 0.45 * (1 + np.cos(np.pi * i / n))
+        done = i / early if i < early else (i - early) / (n - early)
+        decay = schedule.rate * (0.1 + 0.45 * (1 + np.cos(np.pi * done)))
         warm = min(1.0, (i + 1) / 10)
-        for group in optimiser.param_groups:
-            group["lr"] = group["rate"] * schedule.rate * decay * warm
+        for group, waits in zip(optimiser.param_groups, late, strict=True):
+            group["lr"] = 0.0 if waits and i < early else group["rate"] * decay * warm
         draw = problem.draw(schedule.frames, schedule.pixels, generator)
         fade = schedule.stance * max(0.0, 1 - 1.5 * i / n)
         loss, _ = problem.loss(x, guess, draw, stance_weight=fade)
