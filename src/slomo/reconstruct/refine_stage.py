@@ -44,7 +44,7 @@ class ReconstructConfig(FitConfig):
     weight_cycle: float = 0.01
     weight_background: float = 0.3
     weight_residual: float = 0.02
-    weight_physics: float = 0.5
+    weight_physics: float = 0.2
 
     def plan(self) -> Plan:
         """What the refinement does at this quality."""

@@ -34,11 +34,11 @@ class PhysicsConfig:
             geometrically over the first half of the first round.
     """
 
-    window: float = 3.3
-    overlap: float = 1.0
+    window: float = 2.4
+    overlap: float = 0.8
     knot: float = 0.45
     dt: float = 0.004
-    iterations: tuple[int, int] = (120, 30)
+    iterations: tuple[int, int] = (150, 40)
     rate: tuple[float, float] = (0.1, 0.02)
     assistance: tuple[float, float] = (0.3, 0.003)
 
