@@ -46,7 +46,9 @@ def _guess(*, phase: float) -> Guess:
     walk = next(g for g in SKELETON.gaits if g.name == "walk")
     q, _ = hypotheses.gait_pose(KIN, walk, GaitHypothesis("walk", 1.2, phase), t, speed=np.full(T, 1.1), leg=0.75)
     position = np.tile([0.0, 0.0, 0.93 * LENGTH], (T, 1))
-    return Guess(_f(position)[None], torch.full((1, T), -0.7), _f(q)[None], torch.full((1, T, 4), -1.0))
+    return Guess(
+        _f(position)[None], torch.full((1, T), -0.7), torch.zeros(1, T, 2), _f(q)[None], torch.full((1, T, 4), -1.0)
+    )
 
 
 def _variables(path: Trajectory) -> dict[str, torch.Tensor]:

@@ -88,7 +88,7 @@ def _case(kin: Kinematics, config: FieldsConfig, *, q: torch.Tensor | None = Non
     x["shape.log_length"] += math.log(SIZE)
     position = torch.tensor([-0.05, 1.6, 0.93 * SIZE]) + torch.arange(F)[:, None] * torch.tensor([step, 0.3 * step, 0])
     guess = Guess(
-        position[None], 0.3 + turn * torch.arange(F)[None].float(),
+        position[None], 0.3 + turn * torch.arange(F)[None].float(), torch.zeros(1, F, 2),
         torch.zeros(1, F, kin.B, 3) if q is None else q.expand(1, F, -1, -1), torch.full((1, F, 4), -1.0),
     )  # fmt: skip
     fields = Fields(config, obs, kin, torch.full((F, K.width * K.height, 3), 0.3))

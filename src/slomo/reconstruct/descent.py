@@ -88,6 +88,7 @@ def descend(
         before = float(rank(problem, run.x, run.guess)[0])
         entry: dict[str, Any] = {"step": name, "loss_before": round(before, 4)}
         held = physics.arrays() if physics else {}  # a step that is resumed simulates anew from where it began
+        progress.update(run.phase / len(steps), name)
         posed, schedule, about = _step(name, problem, run, fields, physics, plan)
         entry |= about
 

@@ -70,6 +70,25 @@ def fit(problem: Problem, root: RootGuess, effort: Effort, *, metres: float, see
         run = (_to_gait, _to_rivals, _to_final)[run.phase](problem, run, losses, root, effort, metres, progress)
 
 
+def polish(problem: Problem, run: Run, schedule: Schedule, *, seed: int, progress: Progress) -> Run:
+    """One hypothesis from where it stands, without a search."""
+    generator = torch.Generator().manual_seed(seed)
+    resumed, start, adam_state = restore(progress.load(), generator)
+    run = resumed or run
+
+    def each(i: int, optimiser: torch.optim.Adam, loss: Tensor) -> None:
+        progress.update(i / schedule.iterations, f"together {i}/{schedule.iterations}, loss {float(loss.min()):.3f}")
+        if progress.checkpoint_due():
+            progress.save(checkpoint(run, i, optimiser, generator))
+
+    run.x = optimise(
+        problem, run.x, run.guess, schedule, generator, start=start, adam_state=adam_state, each=each
+    )  # fmt: skip
+    label = run.labels[0] | {"loss": round(float(rank(problem, run.x, run.guess)[0]), 4)}
+    run.log["together"] = [label]
+    return run
+
+
 def _cost(schedule: Schedule) -> float:
     return schedule.frames * schedule.pixels + 2000
 

@@ -2,26 +2,28 @@
 
 import contextlib
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 
 from slomo.errors import UsageError
-from slomo.reconstruct import evidence_terms, hypotheses, losses
+from slomo.reconstruct import chunks, evidence_terms, hypotheses, losses
 from slomo.reconstruct import fit as fitting
 from slomo.reconstruct.evidence import Evidence, gather
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.observations import Observations, observe
 from slomo.reconstruct.problem import Problem, Schedule
-from slomo.reconstruct.run import as_arrays
+from slomo.reconstruct.run import Run, as_arrays
 from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import Skeleton, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 6
+FIT_VERSION = 8
+
+POLISH = 0.4  # share of the rates with which the chunks of a long clip are polished together
 
 # Of the heading, gait, rivals and final phase.
 ITERATIONS = {"draft": (60, 60, 80, 250), "normal": (100, 120, 150, 1000), "high": (150, 200, 300, 1400)}
@@ -146,16 +148,36 @@ def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
     """
     began, cpu = time.perf_counter(), time.process_time()
     made = prepare(inputs, config)
-    root = hypotheses.root_guess(made.problem.obs, made.skeleton)
+    where = chunks.bounds(made.problem.obs.t.numpy().astype(float))
     with one_thread():
-        effort = _effort(config)
-        run = fitting.fit(made.problem, root, effort, metres=made.metres, seed=config.seed, progress=progress)
+        run = _search(made, config, progress) if len(where) == 1 else _long(inputs, made, where, config, progress)
     report: dict[str, Any] = {
         "hypothesis": run.labels[0], "loss": run.log["final"][0]["loss"], "search": run.log,
         "skeleton": made.skeleton.name, "camera_mode": made.camera_mode, "evidence": made.evidence,
         "seconds": round(time.perf_counter() - began, 1), "cpu_seconds": round(time.process_time() - cpu, 1),
     }  # fmt: skip
     return Artifact(npz={"fit.npz": as_arrays(run)}, json={"report.json": report})
+
+
+def _search(made: Prepared, config: FitConfig, progress: Progress) -> Run:
+    root = hypotheses.root_guess(made.problem.obs, made.skeleton)
+    return fitting.fit(made.problem, root, _effort(config), metres=made.metres, seed=config.seed, progress=progress)
+
+
+def _long(
+    inputs: Inputs, made: Prepared, where: Sequence[tuple[int, int]], config: FitConfig, progress: Progress
+) -> Run:
+    """Each chunk by itself, and then all of them together from what they found."""
+    progress.note(f"fit: a long clip, in {len(where)} chunks that overlap")
+    parts = [prepare(chunks.cut(inputs, *w), config) for w in where]
+    parts = [replace(p, problem=chunks.level(p.problem)) for p in parts]
+    runs = chunks.finished(progress)
+    while len(runs) < len(parts):
+        runs.append(_search(parts[len(runs)], config, chunks.ChunkProgress(progress, runs, len(parts))))
+    joined = chunks.join(made.problem, [p.problem for p in parts], runs, where)
+    schedule = replace(_effort(config).schedules[-1], rate=POLISH)
+    last = chunks.ChunkProgress(progress, runs, len(parts))
+    return fitting.polish(made.problem, joined, schedule, seed=config.seed, progress=last)
 
 
 def _evidence(inputs: Inputs, obs: Observations, skeleton: Skeleton, weights: dict[str, float]) -> Evidence | None:

@@ -136,7 +136,7 @@ def placed(kin: Kinematics, root: RootGuess, yaw: Array) -> Guess:
     H, T = yaw.shape
     q = torch.zeros(H, T, kin.B, 3)
     stance = torch.full((H, T, len(s.limbs)), -1.0)
-    return Guess(position=f(np.concatenate([xy, z], -1)), yaw=f(yaw), q=q, stance=stance)
+    return Guess(position=f(np.concatenate([xy, z], -1)), yaw=f(yaw), lean=torch.zeros(H, T, 2), q=q, stance=stance)
 
 
 def posture_angles(kin: Kinematics) -> tuple[Tensor, list[str]]:

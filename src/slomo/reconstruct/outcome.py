@@ -17,8 +17,8 @@ Array = np.ndarray
 
 @dataclass(frozen=True)
 class Outcome:
-    """names: N key points; keypoints (T, N, 3) m; confidence (T, N); contact (T, F); T_world_cam (T, 4, 4) m; body: posed
-    at every time, in the fit's units, of which `metres_per_unit` says the length."""
+    """names: N key points; keypoints (T, N, 3) m; confidence (T, N); contact (T, F); T_world_cam (T, 4, 4) m; body at
+    every time, in the fit's units, of which `metres_per_unit` says the length."""
 
     names: tuple[str, ...]
     keypoints: Array

@@ -14,7 +14,7 @@ from slomo.reconstruct.kinematics import rot
 
 Tensor = torch.Tensor
 
-MAX_FEATURES = 64  # frequencies at most: a long clip gets a coarser grid of frequencies up to the same highest one
+MAX_FEATURES = 512  # frequencies at most: beyond a minute they are farther apart, and motion a minute apart is alike
 
 
 @dataclass(frozen=True)
@@ -22,12 +22,14 @@ class Guess:
     """What the MLPs correct, at every time of the clip.
 
     Attributes:
-        position: (H, T, 3) world units. yaw: (H, T) rad, heading of the body. q: (H, T, B, 3) rad.
+        position: (H, T, 3) world units. yaw: (H, T) rad, heading of the body; lean: (H, T, 2) rad, its pitch and roll.
+        q: (H, T, B, 3) rad.
         stance: (H, T, F) hypothetical contact in [0, 1] of each limb; a half where there is no hypothesis.
     """
 
     position: Tensor
     yaw: Tensor
+    lean: Tensor
     q: Tensor
     stance: Tensor
 
@@ -88,7 +90,8 @@ class Trajectory:
         dq = mlp(variables, "Q", self.fq[at])
         dg = mlp(variables, "G", self.fg[at])
         position = guess.position[:, at] + dg[..., :3] * length[:, None, None]
-        yaw, pitch, roll = guess.yaw[:, at] + dg[..., 3], dg[..., 4], dg[..., 5]
+        yaw = guess.yaw[:, at] + dg[..., 3]
+        pitch, roll = (guess.lean[:, at] + dg[..., 4:]).unbind(-1)
         R = rot(2, yaw) @ rot(1, pitch) @ rot(0, roll)
         q = guess.q[:, at]
         q = torch.cat([q[:, :, :1], q[:, :, 1:] + dq.reshape(*dq.shape[:2], self.B - 1, 3)], 2)
