@@ -2,10 +2,8 @@
 
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 
-from slomo.reconstruct.colour import cut, learn_colours, to_lab
 from slomo.reconstruct.flow import Flow, sample
 from slomo.reconstruct.instances import Choice, Look, components, distance, tell_apart
 from slomo.reconstruct.instances_motion import SharedMotion, foreign
@@ -19,9 +17,9 @@ from slomo.reconstruct.segment import (
     grown,
     no_subject,
 )
+from slomo.reconstruct.surroundings import give_back_surroundings
 from slomo.reconstruct.u2net import U2Net
 
-_FOREIGN = 0.17  # part of a mask in patches of the surroundings' colours, from which on it is cut anew
 _FAST = 6.0  # px of motion that make a start no better
 _ALIKE = 0.75  # likeness from which on a piece may be the subject's
 _SURELY_ALIKE = 0.9  # the same of a piece that does not move as the subject did
@@ -61,7 +59,7 @@ class SaliencySegmenter:
             track.follow(order, lambda: progress(0.2 + 0.5 * len(track.layers) / len(keys)))
         layers = track.layers
         told = track.settle_who_is_who()
-        repaired = _give_back_surroundings(frames, layers)
+        repaired = give_back_surroundings(frames, layers)
         progress(0.8)
         probability = blend_over_time(layers, flow, lambda f: progress(0.8 + 0.15 * f))
         masks, certainty = np.empty(frames.shape[:3], bool), np.zeros(T)
@@ -265,45 +263,6 @@ def _instances(probability: np.ndarray) -> list[np.ndarray]:
     """What stands out in a picture and is more than a fifth of the largest of it."""
     pieces = components(probability > 0.5, 0.002 * probability.size)
     return [c for c in pieces if c.sum() > 0.2 * pieces[0].sum()]
-
-
-def _give_back_surroundings(frames: np.ndarray, layers: dict[int, np.ndarray]) -> int:
-    """Take out of `layers`, in place, what the network added of furniture and the like. Returns the frames concerned.
-
-    Colours are learned from the quarter of the masks that are smallest (though no slivers), against their
-    surroundings. A mask a good part of which is patches of the colours of those surroundings is cut anew with them;
-    what then is left without most of the usual area says nothing and is dropped, for the frames next to it to fill.
-    """
-    bodies = {k: p > 0.5 for k, p in layers.items()}
-    area = {k: int(b.sum()) for k, b in bodies.items() if b.any()}
-    usual = np.median(list(area.values())) if area else 0.0
-    whole = sorted((k for k in area if area[k] > 0.3 * usual), key=lambda k: area[k])
-    trusted = whole[: max(2, len(whole) // 4)]
-    if len(trusted) < 2:
-        return 0
-    model = learn_colours(frames, {k: bodies[k] for k in trusted}, reach=2.0)
-    colour = lambda k: cv2.GaussianBlur(model(to_lab(frames[k])), (0, 0), 1.5)  # noqa: E731
-    swallowing = [k for k in area if _foreign(bodies[k], colour(k)) > _FOREIGN]
-    for k in swallowing:
-        # The network has shown here that it does not know, so colour outweighs it.
-        logit = 2.0 * (np.clip(colour(k), -2.0, 2.0) - 0.5) + layers[k] - 0.5
-        probability = np.where(grown(bodies[k], 0.1), 1.0 / (1.0 + np.exp(-logit)), 0.0)
-        layers[k] = cut(frames[k], probability).astype(np.float16)
-    if swallowing:
-        left = {k: float((p > 0.5).sum()) for k, p in layers.items()}
-        trusted_area = np.median([area[k] for k in trusted])
-        for k in swallowing:
-            if left[k] < 0.5 * trusted_area and len(layers) > len(left) // 3:
-                del layers[k]
-    return len(swallowing)
-
-
-def _foreign(body: np.ndarray, colour: np.ndarray) -> float:
-    """Part of a mask that is whole patches of the surroundings' colours; the speckles of a coat do not count."""
-    radius = max(1, round(0.06 * np.sqrt(body.sum())))
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    patches = cv2.morphologyEx((body & (colour < -0.5)).astype(np.uint8), cv2.MORPH_OPEN, disc)
-    return float(patches.sum() / body.sum())
 
 
 def _clarity(probability: np.ndarray, mask: np.ndarray) -> float:
