@@ -72,7 +72,7 @@ def test_joined_chunks_move_as_the_chunks_did(walk, short):
         guess = type(guess)(position, f(yaw), f(np.stack([pitch, roll], -1)), q, guess.stance[:, a:b])
         x = part.variables(1, torch.Generator().manual_seed(0)) | {k: v for k, v in one.x.items() if "shape" in k}
         runs.append(type(one)(one.phase, x, guess, one.labels, one.log))
-    run = chunks.join(whole, parts, runs, where)
+    run = chunks.join(whole, [p.path for p in parts], runs, where)
     wanted = whole.path(one.x, one.guess, one.x["shape.log_length"].exp(), torch.arange(T))
     found = whole.path(run.x, run.guess, run.x["shape.log_length"].exp(), torch.arange(T))
     for x, y in zip(found, wanted, strict=True):

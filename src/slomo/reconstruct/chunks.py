@@ -12,7 +12,7 @@ import torch
 
 from slomo.reconstruct.problem import Problem
 from slomo.reconstruct.run import Run, as_arrays, from_arrays
-from slomo.reconstruct.trajectory import Guess
+from slomo.reconstruct.trajectory import Guess, Trajectory
 from slomo.stage import Arrays, Artifact, Inputs, Progress
 
 Array = np.ndarray
@@ -110,17 +110,17 @@ def level(problem: Problem) -> Problem:
     return replace(problem, tilt_spread=LEVEL * problem.tilt_spread)
 
 
-def join(whole: Problem, parts: Sequence[Problem], runs: Sequence[Run], where: Sequence[tuple[int, int]]) -> Run:
+def join(whole: Problem, paths: Sequence[Trajectory], runs: Sequence[Run], where: Sequence[tuple[int, int]]) -> Run:
     """One run over the whole clip: its guess is the motion of the chunks, blended where they overlap, its networks of
     time start at nothing, its shape is their mean."""
     T = len(whole.obs.t)
     weight, total = np.zeros(T), {}
     yaw_before = None
     log: dict = {"chunks": []}
-    for problem, run, (first, last) in zip(parts, runs, where, strict=True):
+    for path, run, (first, last) in zip(paths, runs, where, strict=True):
         n = last - first
         with torch.no_grad():
-            position, R, q = problem.path(run.x, run.guess, run.x["shape.log_length"].exp(), torch.arange(n))
+            position, R, q = path(run.x, run.guess, run.x["shape.log_length"].exp(), torch.arange(n))
         yaw, pitch, roll = _angles(R[0].numpy().astype(float))
         if yaw_before is not None:
             yaw = yaw + 2 * np.pi * np.round((yaw_before[first] - yaw[0]) / (2 * np.pi))

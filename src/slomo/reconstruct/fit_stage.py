@@ -128,7 +128,7 @@ def prepare(inputs: Inputs, config: FitConfig) -> Prepared:
         subject_px=config.subject_px,
     )
     kin = Kinematics(skeleton)
-    path = Trajectory(obs.t, kin.B, joint_hz=config.joint_hz, root_hz=config.root_hz, width=config.width)
+    path = _path(obs.t, kin, config)
     spread = np.radians(config.tilt_moving_deg if mode == "moving" else config.tilt_static_deg)
     weights = config.weights()
     said = _evidence(inputs, obs, skeleton, weights)
@@ -138,6 +138,10 @@ def prepare(inputs: Inputs, config: FitConfig) -> Prepared:
     problem = Problem(obs, kin, path, weights, float(spread), terms, said)
     metres = config.length_m or skeleton.typical_length
     return Prepared(skeleton, problem, metres, mode, masks.npz["masks.npz"], camera.npz["camera.npz"]["K"])
+
+
+def _path(t: torch.Tensor, kin: Kinematics, config: FitConfig) -> Trajectory:
+    return Trajectory(t, kin.B, joint_hz=config.joint_hz, root_hz=config.root_hz, width=config.width)
 
 
 def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
@@ -169,14 +173,15 @@ def _long(
 ) -> Run:
     """Each chunk by itself, and then all of them together from what they found."""
     progress.note(f"fit: a long clip, in {len(where)} chunks that overlap")
-    parts = [prepare(chunks.cut(inputs, *w), config) for w in where]
-    parts = [replace(p, problem=chunks.level(p.problem)) for p in parts]
     runs = chunks.finished(progress)
-    while len(runs) < len(parts):
-        runs.append(_search(parts[len(runs)], config, chunks.ChunkProgress(progress, runs, len(parts))))
-    joined = chunks.join(made.problem, [p.problem for p in parts], runs, where)
+    while len(runs) < len(where):
+        part = prepare(chunks.cut(inputs, *where[len(runs)]), config)
+        part = replace(part, problem=chunks.level(part.problem))
+        runs.append(_search(part, config, chunks.ChunkProgress(progress, runs, len(where))))
+    paths = [_path(made.problem.obs.t[a:b], made.problem.kin, config) for a, b in where]
+    joined = chunks.join(made.problem, paths, runs, where)
     schedule = replace(_effort(config).schedules[-1], rate=POLISH)
-    last = chunks.ChunkProgress(progress, runs, len(parts))
+    last = chunks.ChunkProgress(progress, runs, len(where))
     return fitting.polish(made.problem, joined, schedule, seed=config.seed, progress=last)
 
 
