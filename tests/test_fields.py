@@ -23,6 +23,7 @@ from slomo.reconstruct.problem import Draw, Problem, Variables
 from slomo.reconstruct.silhouette import Intrinsics
 from slomo.reconstruct.trajectory import Guess, Trajectory
 from slomo.skeleton import load_skeleton
+from test_fit import _camera
 
 F, SIZE = 3, 0.5
 K = Intrinsics(110, 110, 63.5, 35.5, 128, 72)
@@ -42,21 +43,12 @@ def kin() -> Kinematics:
     return Kinematics(load_skeleton("quadruped"))
 
 
-def _camera() -> np.ndarray:
-    """A camera one unit above the ground that looks along y, 12 degrees down."""
-    c, s = np.cos(np.radians(12)), np.sin(np.radians(12))
-    M = np.eye(4)
-    M[:3, :3] = np.array([[1, 0, 0], [0, -s, c], [0, -c, -s]])
-    M[2, 3] = 0.8
-    return M
-
-
 def _observations(mask: torch.Tensor) -> Observations:
     n = K.width * K.height
     t = torch.arange(F) / 10
     flat = torch.full((F, n), 1.0, dtype=torch.float64).cumsum(1) / n
     return Observations(
-        t=t, at=torch.arange(F), dt=torch.full((F - 1,), 0.1), K=K, scale=1.0, T_world_cam=np.stack([_camera()] * F),
+        t=t, at=torch.arange(F), dt=torch.full((F - 1,), 0.1), K=K, scale=1.0, T_world_cam=np.stack([_camera(0.8)] * F),
         mask=mask, edge=torch.zeros(F, 1, K.height, K.width), draw_in=flat, draw_out=flat,
         flow=torch.zeros(F - 1, n, 2), flow_ok=torch.ones(F - 1, n, dtype=torch.bool),
         static=torch.zeros(F, 1, K.height, K.width), quality=torch.ones(F), box=np.array([[40, 20, 90, 60.0]] * F),

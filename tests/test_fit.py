@@ -32,12 +32,12 @@ def _one_thread():
     torch.set_num_threads(before)
 
 
-def _camera() -> np.ndarray:
-    """A camera one unit above the ground that looks along y, 12 degrees down."""
+def _camera(height: float = 1.0) -> np.ndarray:
+    """A camera above the ground that looks along y, 12 degrees down."""
     c, s = np.cos(np.radians(12)), np.sin(np.radians(12))
     M = np.eye(4)
     M[:3, :3] = np.array([[1, 0, 0], [0, -s, c], [0, -c, -s]])
-    M[2, 3] = 1.0
+    M[2, 3] = height
     return M
 
 
