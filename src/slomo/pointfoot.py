@@ -8,14 +8,14 @@
 quadruped has 18 degrees of freedom and 12 inputs. q, v, u and lam are laid out as in `motion.Reference`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
 from slomo.errors import InvalidData
-from slomo.robot import Robot
+from slomo.robot import Robot, key_point_names
 
 Array = np.ndarray
 GRAVITY = 9.81  # m/s^2
@@ -34,6 +34,10 @@ class PointFootModel:
         u_max: (C, 3) N, largest |u| along each world axis.
         mu: friction coefficient.  g: m/s^2.
         names: C limb names.
+        pairs: (P, 2) int, columns of points on one rigid foot (toe, heel), which stay `pair_length` apart.
+        pair_length: (P,) m.
+        clearance: (C,) m, least distance of a point below the body's origin along the body's z axis; -inf where
+            the point is free (a hand).
     """
 
     mass: float
@@ -46,6 +50,9 @@ class PointFootModel:
     names: tuple[str, ...]
     mu: float = 0.6
     g: float = GRAVITY
+    pairs: Array = field(default_factory=lambda: np.zeros((0, 2), int))
+    pair_length: Array = field(default_factory=lambda: np.zeros(0))
+    clearance: Array = field(default_factory=lambda: np.array(-np.inf))  # one number counts for every point
 
     def __post_init__(self):
         C = len(self.names)
@@ -62,11 +69,31 @@ class PointFootModel:
             raise InvalidData("mass, foot_mass, u_max and mu need positive numbers", where="model")
         if not np.all((self.leg_min >= 0) & (self.leg_min < self.leg_max)):
             raise InvalidData("needs 0 <= leg_min < leg_max", where="model legs")
+        self._check_pairs(C)
+        clearance = np.asarray(self.clearance, float)
+        if clearance.shape not in ((), (C,)) or not np.all(clearance < np.inf):
+            raise InvalidData(f"needs {C} numbers below infinity", where="model clearance")
+        object.__setattr__(self, "clearance", np.full(C, clearance))
+
+    def _check_pairs(self, C: int) -> None:
+        pairs = np.ascontiguousarray(np.reshape(self.pairs, (-1, 2)), dtype=np.int64)
+        length = np.ascontiguousarray(self.pair_length, float)
+        if np.any((pairs < 0) | (pairs >= C)) or len(np.unique(pairs)) != pairs.size:
+            raise InvalidData(f"needs different columns of 0 to {C - 1}", where="model pairs")
+        if length.shape != (len(pairs),) or not np.all((length > 0) & np.isfinite(length)):
+            raise InvalidData("needs one length above 0 for each pair", where="model pair_length")
+        object.__setattr__(self, "pairs", pairs)
+        object.__setattr__(self, "pair_length", length)
 
     @property
     def C(self) -> int:
         """Number of contact points."""
         return len(self.names)
+
+    @property
+    def key_points(self) -> tuple[str, ...]:
+        """Names of the points in key-point motions: `<limb>_foot`, or the limb's name where it is a toe, heel or hand."""
+        return key_point_names(self.names)
 
     @property
     def total_mass(self) -> float:

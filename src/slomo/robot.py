@@ -18,7 +18,7 @@ import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
 from slomo.errors import InvalidData
-from slomo.robot_file import RobotFile, find_robot_file, find_urdf, read_robot_file, robot_folders
+from slomo.robot_file import HUMANOID_LIMBS, RobotFile, find_robot_file, find_urdf, read_robot_file, robot_folders
 
 Array = np.ndarray
 
@@ -79,6 +79,11 @@ class Robot:
     def foot_names(self) -> tuple[str, ...]:
         """Foot frames in limb order: the `point_names` of references and roll-outs."""
         return tuple(limb.foot for limb in self.limbs)
+
+    @property
+    def key_points(self) -> tuple[str, ...]:
+        """Names of the limbs' ends in key-point motions (see `key_point_names`)."""
+        return key_point_names(self.limb_names)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -151,6 +156,11 @@ class Robot:
         pin.framesForwardKinematics(self.model, data, q)
         T_world_base = data.oMf[self.model.getFrameId(self.base)]
         return np.array([T_world_base.actInv(data.oMf[self.model.getFrameId(n)].translation) for n in names])
+
+
+def key_point_names(limbs: tuple[str, ...]) -> tuple[str, ...]:
+    """`<limb>_foot` of a quadruped's limbs; a humanoid's (left_toe, ...) are named after the point itself."""
+    return limbs if limbs == HUMANOID_LIMBS else tuple(f"{limb}_foot" for limb in limbs)
 
 
 def list_robots() -> list[str]:

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from slomo.errors import InvalidData, UsageError
 
 QUADRUPED_LIMBS = ("front_left", "front_right", "hind_left", "hind_right")
+HUMANOID_LIMBS = ("left_toe", "left_heel", "right_toe", "right_heel", "left_hand", "right_hand")
 
 
 class _Strict(BaseModel):
