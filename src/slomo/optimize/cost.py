@@ -4,73 +4,68 @@
     orientation                      w |log(R_ref^T R)|^2
     inputs                           w |u - u_ref|^2
     acceleration                     w |sum_c u_c / m + g|^2 of the body
-    slip                             w |s(gamma) v_next_xy|^2 of each point, s = gamma / (gamma + slip_load)
-    leg length                       augmented Lagrangian of leg_min <= |p + R hip - f| <= leg_max
+    slip                             w |s(gamma) v_next_t|^2 of each point, s = gamma / (gamma + slip_load)
+    constraints                      augmented Lagrangian of `constraints`, of the friction cone of points that stick,
+                                     and of the end state of a cyclic motion
 
 The cost is (1/2) sum h w r^2 over the steps of length h, so that weights mean the same at any dt.
 """
 
-from math import sqrt
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
 
-from slomo.optimize import so3
+from slomo.optimize import constraints, so3
+from slomo.optimize.contact import tangents
 from slomo.optimize.jit import compiled
 
 Array = np.ndarray
 
+# Penalty of a friction cone relative to that of the constraints: 1 N is as bad as 1 mm.
+_CONE = 1e-6
+# Share of the cone that points that stick may use, so that what the multipliers leave stays inside it.
+_INSIDE = 0.995
+
 
 class Task(NamedTuple):
-    """What is wanted over N steps (N + 1 knots).
+    """What is wanted over N steps (N + 1 knots), with nu = 3 C inputs, or one more where step lengths are unknown.
 
     Attributes:
-        h: (N + 1,) s, step lengths; the last is the weight of the end state.
-        heights: (N + 1, C) m, ground under each point.
-        q_ref, v_ref, u_ref: (N + 1, 7 + 3 C), (N + 1, 6 + 3 C), (N, 3 C).
-        w_x: (N + 1, 12 + 6 C) weights in tangent order.  w_u: (N, 3 C).
+        h: (N + 1,) s, step lengths (nominal ones, where they are unknown); the last is the weight of the end state.
+        ground: (N + 1, C, 4) plane under each point: unit normal n and offset d (m), gap n . f - d.
+        stick: (N, C) bool, points that may not slide during a step (see `contact`).
+        q_ref, v_ref, u_ref: (N + 1, 7 + 3 C), (N + 1, 6 + 3 C), (N, nu).
+        w_x: (N + 1, 12 + 6 C) weights in tangent order.  w_u: (N, nu).
+        u_low, u_high: (N, nu) limits of the inputs, N (and s).
         w_acceleration, w_slip: weights.
         slip_load: N, normal force from which slip counts half.
+        cyclic: whether the end state must be the first one, turned about z and moved by `shift`.
+        shift: (4,) m, m, m, rad: p_end = R_z(shift[3]) p_first + shift[:3].
     """
 
     h: Array
-    heights: Array
+    ground: Array
+    stick: Array
     q_ref: Array
     v_ref: Array
     u_ref: Array
     w_x: Array
     w_u: Array
+    u_low: Array
+    u_high: Array
     w_acceleration: float
     w_slip: float
     slip_load: float
-
-
-@compiled
-def _leg(body, q, R, c, d):
-    """Vector d (3,) from foot to hip and its length."""
-    for i in range(3):
-        d[i] = q[i] - q[7 + 3 * c + i]
-        for k in range(3):
-            d[i] += R[i, k] * body.hips[c, k]
-    return max(sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), 1e-9)
-
-
-@compiled
-def leg_violation(body, q, out):
-    """out (C, 2): leg_min - length and length - leg_max, m; positive is a violation."""
-    R, d = np.empty((3, 3)), np.empty(3)
-    so3.matrix(q[3:7], R)
-    for c in range(body.hips.shape[0]):
-        length = _leg(body, q, R, c, d)
-        out[c, 0] = body.leg_min[c] - length
-        out[c, 1] = length - body.leg_max[c]
+    cyclic: bool
+    shift: Array
 
 
 @compiled
 def state_cost(body, task, k, q, v, multiplier, rho):
-    """Cost of a state. multiplier: (C, 2) of the leg limits.  rho: their penalty."""
+    """Cost of a state. multiplier: (M,) of its constraints.  rho: their penalty."""
     nv = v.shape[0]
-    e, R, d = np.empty(3), np.empty((3, 3)), np.empty(3)
+    e, g = np.empty(3), np.empty(multiplier.shape[0])
     J = 0.0
     for i in range(3):
         J += task.w_x[k, i] * (q[i] - task.q_ref[k, i]) ** 2
@@ -82,13 +77,13 @@ def state_cost(body, task, k, q, v, multiplier, rho):
     for i in range(nv):
         J += task.w_x[k, nv + i] * (v[i] - task.v_ref[k, i]) ** 2
     J *= 0.5 * task.h[k]
-    so3.matrix(q[3:7], R)
-    for c in range(body.hips.shape[0]):
-        length = _leg(body, q, R, c, d)
-        for side in range(2):
-            g = body.leg_min[c] - length if side == 0 else length - body.leg_max[c]
-            y = multiplier[c, side]
-            J += (max(0.0, y + rho * g) ** 2 - y * y) / (2 * rho)
+    constraints.values(body, q, g)
+    for n in range(g.shape[0]):
+        y = multiplier[n]
+        if constraints.is_equality(body, n):
+            J += (y + 0.5 * rho * g[n]) * g[n]
+        elif g[n] > -inf:
+            J += (max(0.0, y + rho * g[n]) ** 2 - y * y) / (2 * rho)
     return J
 
 
@@ -96,7 +91,7 @@ def state_cost(body, task, k, q, v, multiplier, rho):
 def state_derivative(body, task, k, q, v, multiplier, rho, Lx, Lxx):
     """Adds gradient and Gauss-Newton Hessian of `state_cost` to Lx (nx,) and Lxx (nx, nx)."""
     nv = v.shape[0]
-    e, R, d, J = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    e, R, J = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     h = task.h[k]
     for i in range(nv):
         w = h * task.w_x[k, nv + i]
@@ -116,36 +111,26 @@ def state_derivative(body, task, k, q, v, multiplier, rho, Lx, Lxx):
             for j in range(3):
                 Lxx[3 + i, 3 + j] += w * J[n, i] * J[n, j]
     so3.matrix(q[3:7], R)
-    g9, index = np.empty(9), np.empty(9, np.int64)
-    for c in range(body.hips.shape[0]):
-        length = _leg(body, q, R, c, d)
-        for side in range(2):
-            g = body.leg_min[c] - length if side == 0 else length - body.leg_max[c]
-            force = multiplier[c, side] + rho * g
-            if force <= 0:
-                continue
-            sign = (-1.0 if side == 0 else 1.0) / length
-            # d = p + R hip - f: dp, d(R exp(w) hip) = R [w] hip = -R [hip] w, -df.
-            b0 = sign * (R[0, 0] * d[0] + R[1, 0] * d[1] + R[2, 0] * d[2])
-            b1 = sign * (R[0, 1] * d[0] + R[1, 1] * d[1] + R[2, 1] * d[2])
-            b2 = sign * (R[0, 2] * d[0] + R[1, 2] * d[1] + R[2, 2] * d[2])
-            p = body.hips[c]
-            g9[3], g9[4], g9[5] = p[1] * b2 - p[2] * b1, p[2] * b0 - p[0] * b2, p[0] * b1 - p[1] * b0
-            for i in range(3):
-                g9[i], g9[6 + i] = sign * d[i], -sign * d[i]
-                index[i], index[3 + i], index[6 + i] = i, 3 + i, 6 + 3 * c + i
-            for i in range(9):
-                Lx[index[i]] += force * g9[i]
-                for j in range(9):
-                    Lxx[index[i], index[j]] += rho * g9[i] * g9[j]
+    g = np.empty(multiplier.shape[0])
+    grad, index = np.empty(9), np.empty(9, np.int64)
+    constraints.values(body, q, g)
+    for n in range(g.shape[0]):
+        force = multiplier[n] + rho * g[n]
+        if not force > 0 and not constraints.is_equality(body, n):
+            continue
+        count = constraints.gradient(body, q, R, n, index, grad)
+        for i in range(count):
+            Lx[index[i]] += force * grad[i]
+            for j in range(count):
+                Lxx[index[i], index[j]] += rho * grad[i] * grad[j]
 
 
 @compiled
-def input_cost(body, task, k, u, v1, lam):
-    """Cost of an input: v1 (6 + 3 C,) and lam (C, 3) are what the step gives."""
+def input_cost(body, task, k, u, v1, lam, multiplier, rho):
+    """Cost of an input; v1 (6 + 3 C,) and lam (C, 3) are what the step gives. multiplier: (C,) of friction cones."""
     C = body.hips.shape[0]
     J = 0.0
-    for i in range(3 * C):
+    for i in range(u.shape[0]):
         J += task.w_u[k, i] * (u[i] - task.u_ref[k, i]) ** 2
     for i in range(3):
         a = -body.g if i == 2 else 0.0
@@ -153,18 +138,49 @@ def input_cost(body, task, k, u, v1, lam):
             a += u[3 * c + i] / body.mass
         J += task.w_acceleration * a * a
     for c in range(C):
-        s = lam[c, 2] / (lam[c, 2] + task.slip_load)
-        J += task.w_slip * s * s * (v1[6 + 3 * c] ** 2 + v1[7 + 3 * c] ** 2)
-    return 0.5 * task.h[k] * J
+        n = task.ground[k + 1, c]
+        gamma = slide = 0.0
+        for i in range(3):
+            gamma += n[i] * lam[c, i]
+            slide += n[i] * v1[6 + 3 * c + i]
+        s = gamma / (gamma + task.slip_load)
+        speed2 = -slide * slide
+        for i in range(3):
+            speed2 += v1[6 + 3 * c + i] ** 2
+        J += task.w_slip * s * s * max(speed2, 0.0)
+    J *= 0.5 * task.h[k]
+    for c in range(C):
+        if task.stick[k, c]:
+            y = multiplier[c]
+            J += (max(0.0, y + rho * _CONE * cone(body, task.ground[k + 1, c], lam[c])) ** 2 - y * y) / (
+                2 * rho * _CONE
+            )
+    return J
 
 
 @compiled
-def input_derivative(body, task, k, u, v1, lam, A, B, D, Lx, Lu, Lxx, Luu, Lux):
+def cone(body, plane, lam):
+    """N, by how much a contact force lam (3,) exceeds the share of the friction cone of points that stick."""
+    gamma = square = 0.0
+    for i in range(3):
+        gamma += plane[i] * lam[i]
+        square += lam[i] * lam[i]
+    return np.sqrt(max(square - gamma * gamma, 0.0)) - _INSIDE * body.mu * gamma
+
+
+@compiled
+def cone_penalty(rho):
+    """Penalty of a friction cone (1/N^2) where that of the constraints is rho (1/m^2)."""
+    return rho * _CONE
+
+
+@compiled
+def input_derivative(body, task, k, u, v1, lam, multiplier, rho, A, B, D, Lx, Lu, Lxx, Luu, Lux):
     """Adds gradient and Gauss-Newton Hessian of `input_cost`; A, B, D as from `dynamics.linearize`."""
-    C = body.hips.shape[0]
+    C, nu = body.hips.shape[0], u.shape[0]
     nv = 6 + 3 * C
     h = task.h[k]
-    for i in range(3 * C):
+    for i in range(nu):
         w = h * task.w_u[k, i]
         Lu[i] += w * (u[i] - task.u_ref[k, i])
         Luu[i, i] += w
@@ -177,31 +193,60 @@ def input_derivative(body, task, k, u, v1, lam, A, B, D, Lx, Lu, Lxx, Luu, Lux):
             Lu[3 * c + i] += w * a / body.mass
             for n in range(C):
                 Luu[3 * c + i, 3 * n + i] += w / body.mass**2
-    w = h * task.w_slip
-    J7 = np.empty(7)  # with respect to the point's height, velocity (3) and input (3)
-    ix = np.empty(4, np.int64)
+    # Residuals of one point depend on its position, velocity, its input, and on h where that is unknown.
+    many = 10 if nu > 3 * C else 9
+    J = np.empty(10)
     for c in range(C):
-        load = lam[c, 2] + task.slip_load
-        s = lam[c, 2] / load
+        plane = task.ground[k + 1, c]
+        gamma = 0.0
+        for i in range(3):
+            gamma += plane[i] * lam[c, i]
+        load = gamma + task.slip_load
+        s = gamma / load
         ds = task.slip_load / (load * load)
-        ix[0] = 8 + 3 * c
-        for n in range(3):
-            ix[1 + n] = nv + 6 + 3 * c + n
-        for i in range(2):
-            row = nv + 6 + 3 * c + i
-            vi = v1[6 + 3 * c + i]
-            for n in range(4):
-                J7[n] = s * A[row, ix[n]] + ds * D[c, 2, n] * vi
-            for n in range(3):
-                J7[4 + n] = s * B[row, 3 * c + n] + ds * D[c, 2, 4 + n] * vi
-            r = w * s * vi
-            for n in range(4):
-                Lx[ix[n]] += r * J7[n]
-                for m in range(4):
-                    Lxx[ix[n], ix[m]] += w * J7[n] * J7[m]
-            for n in range(3):
-                Lu[3 * c + n] += r * J7[4 + n]
-                for m in range(3):
-                    Luu[3 * c + n, 3 * c + m] += w * J7[4 + n] * J7[4 + m]
-                for m in range(4):
-                    Lux[3 * c + n, ix[m]] += w * J7[4 + n] * J7[m]
+        for t in tangents(plane[0], plane[1], plane[2]):
+            vt = 0.0
+            for i in range(3):
+                vt += t[i] * v1[6 + 3 * c + i]
+            for n in range(many):
+                J[n] = 0.0
+                for i in range(3):
+                    row = nv + 6 + 3 * c + i
+                    dv = B[row, 3 * C] if n == 9 else B[row, 3 * c + n - 6] if n >= 6 else 0.0
+                    if n < 6:
+                        dv = A[row, 6 + 3 * c + n if n < 3 else nv + 3 + 3 * c + n]
+                    J[n] += s * t[i] * dv + ds * vt * plane[i] * D[c, i, n]
+            _add_point(h * task.w_slip, h * task.w_slip * s * vt, J, many, c, C, nv, Lx, Lu, Lxx, Luu, Lux)
+        if task.stick[k, c]:
+            force = multiplier[c] + rho * _CONE * cone(body, plane, lam[c])
+            if force > 0:
+                square = 0.0
+                for i in range(3):
+                    square += (lam[c, i] - gamma * plane[i]) ** 2
+                size = max(np.sqrt(square), 1e-9)
+                for n in range(many):
+                    J[n] = 0.0
+                    for i in range(3):
+                        along = (lam[c, i] - gamma * plane[i]) / size - _INSIDE * body.mu * plane[i]
+                        J[n] += along * D[c, i, n]
+                _add_point(rho * _CONE, force, J, many, c, C, nv, Lx, Lu, Lxx, Luu, Lux)
+
+
+@compiled
+def _add_point(weight, force, J, many, c, C, nv, Lx, Lu, Lxx, Luu, Lux):
+    """Adds a residual with derivative J (point 3, velocity 3, input 3, step length): force * J and weight * J J^T."""
+    for n in range(many):
+        a = 6 + 3 * c + n if n < 3 else nv + 3 + 3 * c + n if n < 6 else 3 * c + n - 6 if n < 9 else 3 * C
+        if n < 6:
+            Lx[a] += force * J[n]
+        else:
+            Lu[a] += force * J[n]
+        for m in range(many):
+            b = 6 + 3 * c + m if m < 3 else nv + 3 + 3 * c + m if m < 6 else 3 * c + m - 6 if m < 9 else 3 * C
+            value = weight * J[n] * J[m]
+            if n < 6 and m < 6:
+                Lxx[a, b] += value
+            elif n >= 6 and m >= 6:
+                Luu[a, b] += value
+            elif n >= 6:
+                Lux[a, b] += value

@@ -7,182 +7,53 @@ function make every step a descent step. The work is linear in the number of kno
 """
 
 from math import inf, isfinite
-from typing import NamedTuple
 
 import numpy as np
 
-from slomo.optimize.cost import input_cost, input_derivative, state_cost, state_derivative
-from slomo.optimize.dense import box_qp, copy, solve_lower, solve_upper, transpose_times
-from slomo.optimize.dynamics import linearize, minus, plus, step
+from slomo.optimize.closing import end_cost, end_gap
+from slomo.optimize.cost import input_cost, state_cost
+from slomo.optimize.dense import copy
+from slomo.optimize.dynamics import minus, plus, step
 from slomo.optimize.jit import compiled
-
-Array = np.ndarray
+from slomo.optimize.riccati import backward
 
 CONVERGED, ITERATIONS, STUCK, NOT_FINITE = 0, 1, 2, 3
 STATUS = ("converged", "iteration limit", "no descent", "not finite")
 
-# Proximal weights of the Levenberg-Marquardt term: positions, velocities, inputs (1/m^2, s^2/m^2, 1/N^2).
-_PROX_Q, _PROX_V, _PROX_U = 1.0, 1e-2, 1e-4
 # Least weight of the gaps in the merit function. Near an optimum the cost's slope vanishes while closing a gap still
 # costs in second order; without this the line search refuses the good step, as for a robot that simply stands.
 _LEAST_PENALTY = 1e-2
 
 
-class Iterate(NamedTuple):
-    """qs (N + 1, 7 + 3 C), vs (N + 1, 6 + 3 C), us (N, 3 C), lam (N, C, 3); multiplier (N + 1, C, 2) of leg limits."""
-
-    qs: Array
-    vs: Array
-    us: Array
-    lam: Array
-    multiplier: Array
-
-
-class Work(NamedTuple):
-    """Everything else that a solve writes to; `K` (N, 3 C, nx) are the feedback gains, `gap` (N, nx) the defects."""
-
-    A: Array
-    B: Array
-    D: Array
-    Lx: Array
-    Lu: Array
-    K: Array
-    k: Array
-    dx: Array
-    du: Array
-    gap: Array
-    trial: Iterate
-    trial_gap: Array
-    q1: Array
-    v1: Array
-
-    @classmethod
-    def make(cls, N: int, C: int) -> "Work":
-        nv, nu = 6 + 3 * C, 3 * C
-        nx = 2 * nv
-        z = np.zeros
-        return cls(
-            A=z((N, nx, nx)), B=z((N, nx, nu)), D=z((C, 3, 7)), Lx=z((N + 1, nx)), Lu=z((N, nu)),
-            K=z((N, nu, nx)), k=z((N, nu)), dx=z((N + 1, nx)), du=z((N, nu)), gap=z((N, nx)),
-            trial=Iterate(z((N + 1, nv + 1)), z((N + 1, nv)), z((N, nu)), z((N, C, 3)), z((N + 1, C, 2))),
-            trial_gap=z((N, nx)), q1=z(nv + 1), v1=z(nv),
-        )  # fmt: skip
+@compiled
+def length(body, task, u, k):
+    """Length of step k, s: given, or the input after the forces."""
+    C = body.hips.shape[0]
+    return u[3 * C] if u.shape[0] > 3 * C else task.h[k]
 
 
 @compiled
-def evaluate(body, task, kappa, it, rho, gap, q1, v1):
+def evaluate(body, task, kappa, it, rho, gap, w):
     """Cost of an iterate (its lam is written) and the l1 norm of its gaps (N, nx, written)."""
     N = it.us.shape[0]
     J = total = 0.0
     for k in range(N):
-        step(body, task.h[k], kappa, task.heights[k + 1], it.qs[k], it.vs[k], it.us[k], q1, v1, it.lam[k])
-        J += input_cost(body, task, k, it.us[k], v1, it.lam[k])
-        minus(q1, v1, it.qs[k + 1], it.vs[k + 1], gap[k])
+        u, ground, h = it.us[k], task.ground[k + 1], length(body, task, it.us[k], k)
+        step(body, h, kappa, ground, task.stick[k], it.qs[k], it.vs[k], u, w.q1, w.v1, it.lam[k])
+        J += input_cost(body, task, k, u, w.v1, it.lam[k], it.cone[k], rho)
+        minus(w.q1, w.v1, it.qs[k + 1], it.vs[k + 1], gap[k])
         for i in range(gap.shape[1]):
             total += abs(gap[k, i])
     for k in range(N + 1):
         J += state_cost(body, task, k, it.qs[k], it.vs[k], it.multiplier[k], rho)
+    if task.cyclic:
+        end_gap(task, it.qs[0], it.vs[0], it.qs[N], it.vs[N], w.end)
+        J += end_cost(w.end, it.closing, rho)
     return J, total
 
 
 @compiled
-def backward(body, task, kappa, it, rho, reg, free_start, w):
-    """Riccati pass about an iterate whose gaps are in w.gap: gains and the first step w.dx[0]. False: reg too small."""
-    N, nu = it.us.shape
-    nx = w.dx.shape[1]
-    nv = nx // 2
-    Vx, Vxx = np.zeros(nx), np.zeros((nx, nx))
-    Qxx, Qux, Quu, Qu = np.empty((nx, nx)), np.empty((nu, nx)), np.empty((nu, nu)), np.empty(nu)
-    AtV, VA = np.empty((nx, nx)), np.empty((nx, nx))
-    BtV, VB = np.empty((nu, nx)), np.empty((nx, nu))
-    S, L = np.empty((nu, nx)), np.empty((nx, nx))
-    lower, upper = np.empty(nx), np.empty(nx)
-    index, scratch = np.empty(nx, np.int64), np.empty((nx, 1))
-    for k in range(N, -1, -1):
-        Lx = w.Lx[k]
-        for i in range(nx):
-            Lx[i] = 0.0
-        if k == N:
-            state_derivative(body, task, k, it.qs[k], it.vs[k], it.multiplier[k], rho, Lx, Vxx)
-            for i in range(nx):
-                Vx[i] = Lx[i]
-        else:
-            A, B, Lu = w.A[k], w.B[k], w.Lu[k]
-            q, v, u, height = it.qs[k], it.vs[k], it.us[k], task.heights[k + 1]
-            linearize(body, task.h[k], kappa, height, q, v, u, w.q1, w.v1, it.lam[k], A, B, w.D)
-            for i in range(nx):
-                for j in range(nx):
-                    Vx[i] += Vxx[i, j] * w.gap[k, j]
-            transpose_times(A, Vxx, AtV)
-            transpose_times(B, Vxx, BtV)
-            for i in range(nx):
-                for j in range(nx):
-                    VA[j, i] = AtV[i, j]
-                for j in range(nu):
-                    VB[i, j] = BtV[j, i]
-            transpose_times(A, VA, Qxx)
-            transpose_times(B, VA, Qux)
-            transpose_times(B, VB, Quu)
-            for i in range(nu):
-                Lu[i] = 0.0
-            input_derivative(body, task, k, it.us[k], w.v1, it.lam[k], A, B, w.D, Lx, Lu, Qxx, Quu, Qux)
-            state_derivative(body, task, k, it.qs[k], it.vs[k], it.multiplier[k], rho, Lx, Qxx)
-            for i in range(nu):
-                Quu[i, i] += reg * _PROX_U
-                lower[i], upper[i] = -body.u_max[i] - it.us[k, i], body.u_max[i] - it.us[k, i]
-                s = Lu[i]
-                for j in range(nx):
-                    s += B[j, i] * Vx[j]
-                Qu[i] = s
-            n = box_qp(Quu, Qu, lower, upper, w.k[k], index, L, scratch)
-            if n < 0:
-                return False
-            # K_free = -Quu_free^-1 Qux_free; V = Qxx - S^T S with S = L^-1 Qux_free.
-            K = w.K[k]
-            for i in range(nu):
-                for j in range(nx):
-                    K[i, j] = 0.0
-            for i in range(n):
-                for j in range(nx):
-                    S[i, j] = Qux[index[i], j]
-            solve_lower(L, n, S)
-            for i in range(nx):
-                s = Lx[i]
-                for j in range(nx):
-                    s += A[j, i] * Vx[j]
-                for j in range(nu):
-                    s += Qux[j, i] * w.k[k, j]
-                scratch[i, 0] = s
-            for i in range(nx):
-                Vx[i] = scratch[i, 0]
-            copy(Qxx, Vxx)
-            for m in range(n):
-                for i in range(nx):
-                    s = S[m, i]
-                    for j in range(nx):
-                        Vxx[i, j] -= s * S[m, j]
-            solve_upper(L, n, S)
-            for i in range(n):
-                for j in range(nx):
-                    K[index[i], j] = -S[i, j]
-        for i in range(nx):
-            Vxx[i, i] += reg * (_PROX_Q if i < nv else _PROX_V)
-            for j in range(i):
-                Vxx[i, j] = Vxx[j, i] = 0.5 * (Vxx[i, j] + Vxx[j, i])
-    if free_start:
-        # Any start, but with its points not under the ground.
-        for i in range(nx):
-            lower[i], upper[i] = -inf, inf
-        for c in range(nu // 3):
-            lower[8 + 3 * c] = task.heights[0, c] - it.qs[0, 9 + 3 * c]
-        return box_qp(Vxx, Vx, lower, upper, w.dx[0], index, L, scratch) >= 0
-    for i in range(nx):
-        w.dx[0, i] = 0.0
-    return True
-
-
-@compiled
-def forward(body, it, w):
+def forward(task, it, w):
     """The full Newton step w.dx, w.du from w.dx[0]; returns the slope of the cost along it."""
     N, nu = it.us.shape
     nx = w.dx.shape[1]
@@ -192,7 +63,10 @@ def forward(body, it, w):
             s = w.k[k, i]
             for j in range(nx):
                 s += w.K[k, i, j] * w.dx[k, j]
-            s = min(max(s, -body.u_max[i] - it.us[k, i]), body.u_max[i] - it.us[k, i])
+            if task.cyclic:
+                for j in range(nx):
+                    s += w.Kt[k, i, j] * w.dx[0, j]
+            s = min(max(s, task.u_low[k, i] - it.us[k, i]), task.u_high[k, i] - it.us[k, i])
             w.du[k, i] = s
             slope += w.Lu[k, i] * s
         for i in range(nx):
@@ -205,6 +79,9 @@ def forward(body, it, w):
     for k in range(N + 1):
         for i in range(nx):
             slope += w.Lx[k, i] * w.dx[k, i]
+    if task.cyclic:
+        for i in range(nx):
+            slope += w.Lt[i] * w.dx[0, i]
     return slope
 
 
@@ -214,7 +91,7 @@ def solve(body, task, kappa, it, rho, free_start, max_iterations, tolerance, reg
 
     Args:
         body, task: see `Body` and `Task`.
-        kappa: N m.  it: start, and result.  rho: penalty of the leg limits.
+        kappa: N m.  it: start, and result.  rho: penalty of the constraints.
         free_start: whether the first state is unknown too.
         max_iterations, tolerance: of the decrease still expected, relative to the cost.
         reg: Levenberg-Marquardt factor to start with.
@@ -224,8 +101,12 @@ def solve(body, task, kappa, it, rho, free_start, max_iterations, tolerance, reg
         (status, iterations, cost, l1 norm of the gaps, reg).
     """
     N = it.us.shape[0]
-    J, G = evaluate(body, task, kappa, it, rho, w.gap, w.q1, w.v1)
+    J, G = evaluate(body, task, kappa, it, rho, w.gap, w)
     nu = _LEAST_PENALTY
+    copy(it.multiplier, w.trial.multiplier)
+    copy(it.cone, w.trial.cone)
+    for i in range(it.closing.shape[0]):
+        w.trial.closing[i] = it.closing[i]
     if not isfinite(J + G):
         return NOT_FINITE, 0, J, G, reg
     for iteration in range(max_iterations):
@@ -233,7 +114,7 @@ def solve(body, task, kappa, it, rho, free_start, max_iterations, tolerance, reg
         for _ in range(12):
             slope = inf
             if backward(body, task, kappa, it, rho, reg, free_start, w):
-                slope = forward(body, it, w)
+                slope = forward(task, it, w)
             if isfinite(slope):
                 if G > 1e-12:
                     nu = max(nu, 2.0 * max(slope, 0.0) / G)
@@ -244,11 +125,10 @@ def solve(body, task, kappa, it, rho, free_start, max_iterations, tolerance, reg
                 for _ in range(8):
                     for k in range(N + 1):
                         plus(it.qs[k], it.vs[k], w.dx[k], alpha, w.trial.qs[k], w.trial.vs[k])
-                        copy(it.multiplier[k], w.trial.multiplier[k])
                     for k in range(N):
                         for i in range(it.us.shape[1]):
                             w.trial.us[k, i] = it.us[k, i] + alpha * w.du[k, i]
-                    Jt, Gt = evaluate(body, task, kappa, w.trial, rho, w.trial_gap, w.q1, w.v1)
+                    Jt, Gt = evaluate(body, task, kappa, w.trial, rho, w.trial_gap, w)
                     if isfinite(Jt + Gt) and Jt + nu * Gt <= J + nu * G + 1e-4 * alpha * descent:
                         accepted = True
                         break
@@ -292,8 +172,9 @@ def close(body, task, kappa, it, w):
             s = it.us[k, i]
             for j in range(d.shape[0]):
                 s += w.K[k, i, j] * d[j]
-            it.us[k, i] = min(max(s, -body.u_max[i]), body.u_max[i])
-        step(body, task.h[k], kappa, task.heights[k + 1], it.qs[k], it.vs[k], it.us[k], q, v, it.lam[k])
+            it.us[k, i] = min(max(s, task.u_low[k, i]), task.u_high[k, i])
+        h, ground = length(body, task, it.us[k], k), task.ground[k + 1]
+        step(body, h, kappa, ground, task.stick[k], it.qs[k], it.vs[k], it.us[k], q, v, it.lam[k])
     for i in range(q.shape[0]):
         it.qs[N, i] = q[i]
     for i in range(v.shape[0]):

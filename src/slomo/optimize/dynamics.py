@@ -3,7 +3,8 @@
     v_next = v + h a(q, v, u, lam),  q_next = q + h v_next  (orientation: R exp(h w_next)).
 
 Tangent vectors dx (12 + 6 C) are ordered position, rotation (right), points, velocity, angular velocity, point
-velocities. The ground under point c during step k is the plane z = heights[k + 1, c].
+velocities. The ground under point c during step k is the plane ground[k + 1, c]: unit normal n and offset d, with the
+gap n . f - d. Where h is an unknown, it is the input after the forces.
 """
 
 from typing import NamedTuple
@@ -19,7 +20,7 @@ Array = np.ndarray
 
 
 class Body(NamedTuple):
-    """`PointFootModel` as compiled code takes it (attributes as there; `u_max` is (3 C,))."""
+    """`PointFootModel` as compiled code takes it (attributes as there)."""
 
     mass: float
     inertia: Array
@@ -28,7 +29,9 @@ class Body(NamedTuple):
     leg_min: Array
     leg_max: Array
     foot_mass: Array
-    u_max: Array
+    pairs: Array
+    pair_length: Array
+    clearance: Array
     mu: float
     g: float
 
@@ -42,7 +45,9 @@ class Body(NamedTuple):
             model.leg_min,
             model.leg_max,
             model.foot_mass,
-            np.ascontiguousarray(model.u_max.ravel()),
+            model.pairs,
+            model.pair_length,
+            model.clearance,
             float(model.mu),
             float(model.g),
         )
@@ -86,14 +91,14 @@ def _integrate(h, q, v1, q1):
 
 
 @compiled
-def step(body, h, kappa, height, q, v, u, q1, v1, lam):
-    """The next state into q1, v1 and the contact forces into lam (C, 3). height: (C,) m. u: (3 C,) N."""
+def step(body, h, kappa, ground, stick, q, v, u, q1, v1, lam):
+    """The next state into q1, v1 and the contact forces into lam (C, 3). ground: (C, 4). stick: (C,). u: (3 C,) N."""
     R, torque = np.empty((3, 3)), np.empty(3)
     _body_velocity(body, h, q, v, u, R, torque, v1)
     for c in range(body.hips.shape[0]):
         i, j, m = 3 * c, 6 + 3 * c, body.foot_mass[c]
-        phi = q[9 + 3 * c] - height[c]
-        contact_force(phi, v[j : j + 3], u[i : i + 3], m, h, body.mu, body.g, kappa, lam[c])
+        f, vf, uf = q[7 + i : 10 + i], v[j : j + 3], u[i : i + 3]
+        contact_force(ground[c], f, vf, uf, m, h, body.mu, body.g, kappa, stick[c], lam[c])
         for k in range(3):
             v1[j + k] = v[j + k] + h * (lam[c, k] - u[i + k]) / m
         v1[j + 2] -= h * body.g
@@ -101,10 +106,11 @@ def step(body, h, kappa, height, q, v, u, q1, v1, lam):
 
 
 @compiled
-def linearize(body, h, kappa, height, q, v, u, q1, v1, lam, A, B, D):
-    """`step` with A (nx, nx), B (nx, 3 C), its derivative, and D (C, 3, 7) of the contact forces.
+def linearize(body, h, kappa, ground, stick, q, v, u, q1, v1, lam, A, B, D):
+    """`step` with A (nx, nx), B (nx, nu), its derivative, and D (C, 3, 10) of the contact forces.
 
-    A and B must come zeroed or from an earlier call: only entries that can differ from zero are written.
+    A and B must come zeroed or from an earlier call: only entries that can differ from zero are written. With one more
+    column than forces, B's last one is the derivative with respect to h.
     """
     C = body.hips.shape[0]
     nv = 6 + 3 * C
@@ -161,27 +167,34 @@ def linearize(body, h, kappa, height, q, v, u, q1, v1, lam, A, B, D):
     # Points.
     for c in range(C):
         i, j, m = 3 * c, 6 + 3 * c, body.foot_mass[c]
-        phi = q[9 + 3 * c] - height[c]
-        contact_derivative(phi, v[j : j + 3], u[i : i + 3], m, h, body.mu, body.g, kappa, lam[c], D[c])
+        f, vf, uf = q[7 + i : 10 + i], v[j : j + 3], u[i : i + 3]
+        contact_derivative(ground[c], f, vf, uf, m, h, body.mu, body.g, kappa, stick[c], lam[c], D[c])
         s = h / m
         for k in range(3):
             v1[j + k] = v[j + k] + h * (lam[c, k] - u[i + k]) / m
             row = nv + j + k
-            A[row, j + 2] = s * D[c, k, 0]
             for n in range(3):
-                A[row, nv + j + n] = s * D[c, k, 1 + n]
-                B[row, i + n] = s * D[c, k, 4 + n]
+                A[row, j + n] = s * D[c, k, n]
+                A[row, nv + j + n] = s * D[c, k, 3 + n]
+                B[row, i + n] = s * D[c, k, 6 + n]
             A[row, nv + j + k] += 1.0
             B[row, i + k] -= s
             for n in range(3):
+                A[j + k, j + n] = h * A[row, j + n]
                 A[j + k, nv + j + n] = h * A[row, nv + j + n]
-                A[j + k, j + n] = 1.0 if n == k else 0.0
                 B[j + k, i + n] = h * B[row, i + n]
-            A[j + k, j + 2] += h * A[row, j + 2]
+            A[j + k, j + k] += 1.0
             B[nv + k, i + k] = h / body.mass
             B[k, i + k] = h * h / body.mass
         v1[j + 2] -= h * body.g
     _integrate(h, q, v1, q1)
+
+    if B.shape[1] > 3 * C:
+        for i in range(nv):
+            B[nv + i, 3 * C] = (v1[i] - v[i]) / h
+            if i >= 6:
+                B[nv + i, 3 * C] += h / body.foot_mass[(i - 6) // 3] * D[(i - 6) // 3, i % 3, 9]
+            B[i, 3 * C] = v1[i] + h * B[nv + i, 3 * C]
 
     # Rotation: exp(h w1)^T d + h Jr(h w1) dw1.
     hw, E, J = h * v1[3:6], np.empty((3, 3)), np.empty((3, 3))
@@ -194,6 +207,11 @@ def linearize(body, h, kappa, height, q, v, u, q1, v1, lam, A, B, D):
             B[3 + i, k] = h * (J[i, 0] * B[r, k] + J[i, 1] * B[r + 1, k] + J[i, 2] * B[r + 2, k])
         for k in range(3):
             A[3 + i, 3 + k] += E[k, i]
+        if B.shape[1] > 3 * C:
+            k = 3 * C
+            B[3 + i, k] = 0.0
+            for n in range(3):
+                B[3 + i, k] += J[i, n] * (v1[3 + n] + h * B[r + n, k])
 
 
 @compiled

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from slomo.errors import InvalidData
 from slomo.motion import KeypointMotion
 from slomo.optimize.cost import Task
-from slomo.optimize.ddp import Iterate
+from slomo.optimize.iterate import Iterate
 from slomo.pointfoot import PointFootModel
 from slomo.terrain import Terrain
 
@@ -93,7 +93,7 @@ def velocities(t: Array, q: Array) -> Array:
 
 
 def targets(motion: KeypointMotion, model: PointFootModel, terrain: Terrain, *, dt: float) -> Targets:
-    """Resample `base`, `<limb>_hip` and `<limb>_foot` to steps of dt (s); feet are lifted to the ground at least.
+    """Resample `base`, `<limb>_hip` and the model's key points to steps of dt (s); points are lifted to the ground.
 
     Raises:
         InvalidData: a key point is missing, or the motion is shorter than two steps.
@@ -104,25 +104,37 @@ def targets(motion: KeypointMotion, model: PointFootModel, terrain: Terrain, *, 
     t = motion.t[0] + dt * np.arange(steps + 1)
     base, c_base = _resample(motion, "base", t)
     hips = [_resample(motion, f"{n}_hip", t) for n in model.names]
-    limbs = [n for n in model.names if np.any(motion.confidence[:, motion.index(f"{n}_foot")] > 0)]
-    if not limbs:
+    seen = [n for n in model.key_points if np.any(motion.confidence[:, motion.index(n)] > 0)]
+    if not seen:
         raise InvalidData("no foot has any confidence", where="keypoints.npz")
     R = _orientation(model.hips, np.stack([x for x, _ in hips], axis=1), np.stack([c for _, c in hips], axis=1))
     points, c_foot = np.empty((len(t), model.C, 3)), np.zeros((len(t), model.C))
-    for c, name in enumerate(model.names):
-        if name in limbs:
-            points[:, c], c_foot[:, c] = _resample(motion, f"{name}_foot", t)
+    for c, name in enumerate(model.key_points):
+        if name in seen:
+            points[:, c], c_foot[:, c] = _resample(motion, name, t)
         else:
-            # Nothing is known of this foot: under its hip, with no weight.
+            # Nothing is known of this point: under its hip, a foot on the ground, with no weight.
             points[:, c] = base + R.apply(model.hips[c])
-            points[:, c, 2] = -np.inf
+            points[:, c, 2] -= 0.5 * (model.leg_min + model.leg_max)[c] if np.isinf(model.clearance[c]) else np.inf
     points[..., 2] = np.maximum(points[..., 2], terrain.height(points))
     q = np.concatenate([base, R.as_quat(), points.reshape(len(t), -1)], axis=1)
     return Targets(t=t - t[0], q=q, v=velocities(t, q), body_confidence=c_base, foot_confidence=c_foot)
 
 
-def make_task(model: PointFootModel, want: Targets, terrain: Terrain, weights: Weights) -> Task:
-    """The solver's task for targets (N + 1 knots)."""
+@dataclass(frozen=True)
+class Steps:
+    """Step lengths as unknowns: shortest and longest as factors of the nominal length, and the weight (per second of
+    motion) of the squared relative deviation from it."""
+
+    shortest: float
+    longest: float
+    weight: float
+
+
+def make_task(
+    model: PointFootModel, want: Targets, terrain: Terrain, weights: Weights, *, steps: Steps | None = None
+) -> Task:
+    """The solver's task for targets (N + 1 knots), with fixed step lengths unless `steps` frees them."""
     T, C = len(want.t), model.C
     nv = 6 + 3 * C
     cb, cf = want.body_confidence[:, None], want.foot_confidence
@@ -132,33 +144,38 @@ def make_task(model: PointFootModel, want: Targets, terrain: Terrain, weights: W
     w_x[:, nv : nv + 3], w_x[:, nv + 3 : nv + 6] = weights.velocity, weights.angular_velocity
     w_x[:, nv + 6 :] = weights.foot_velocity
     h = np.diff(want.t)
+    u_high = np.tile(model.u_max.ravel(), (T - 1, 1))
+    u_low, u_ref, w_u = -u_high, np.zeros((T - 1, 3 * C)), np.full((T - 1, 3 * C), weights.effort)
+    if steps is not None:
+        u_low, u_high = np.column_stack([u_low, steps.shortest * h]), np.column_stack([u_high, steps.longest * h])
+        u_ref, w_u = np.column_stack([u_ref, h]), np.column_stack([w_u, steps.weight / h**2])
     return Task(
         h=np.append(h, h[-1]),
-        heights=np.ascontiguousarray(terrain.height(want.points)),
+        ground=np.ascontiguousarray(terrain.planes(want.points)),
+        stick=np.zeros((T - 1, C), bool),
         q_ref=np.ascontiguousarray(want.q),
         v_ref=np.ascontiguousarray(want.v),
-        u_ref=np.zeros((T - 1, 3 * C)),
+        u_ref=u_ref,
         w_x=w_x,
-        w_u=np.full((T - 1, 3 * C), weights.effort),
+        w_u=w_u,
+        u_low=u_low,
+        u_high=u_high,
         w_acceleration=weights.acceleration,
         w_slip=weights.slip,
         slip_load=weights.slip_load,
+        cyclic=False,
+        shift=np.zeros(4),
     )
 
 
-def make_start(model: PointFootModel, want: Targets, heights: Array) -> Iterate:
+def make_start(model: PointFootModel, want: Targets, task: Task) -> Iterate:
     """Body and feet at their targets, the weight split over the feet near the ground, swinging feet held up."""
     T, C = len(want.t), model.C
-    gap = np.maximum(want.points[..., 2] - heights, 0.0)
+    gap = np.maximum(np.sum(task.ground[..., :3] * want.points, axis=2) - task.ground[..., 3], 0.0)
     near = np.exp(-gap / 0.01) + 1e-3
     share = near / near.sum(axis=1, keepdims=True)
     u = np.zeros((T - 1, C, 3))
     u[..., 2] = share[1:] * model.mass * model.g - (gap[1:] > 0.01) * model.foot_mass * model.g
-    u = np.clip(u, -model.u_max, model.u_max)
-    return Iterate(
-        qs=want.q.copy(),
-        vs=want.v.copy(),
-        us=u.reshape(T - 1, -1),
-        lam=np.zeros((T - 1, C, 3)),
-        multiplier=np.zeros((T, C, 2)),
-    )
+    us = task.u_ref.copy()
+    us[:, : 3 * C] = u.reshape(T - 1, -1)
+    return Iterate.at(want.q, want.v, np.clip(us, task.u_low, task.u_high), C=C, P=len(model.pairs))

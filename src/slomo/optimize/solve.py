@@ -1,19 +1,27 @@
-"""The whole optimisation: homotopy over kappa, augmented Lagrangian over leg lengths, ground under the moving feet."""
+"""The whole optimisation: homotopy over kappa, multipliers of the constraints, ground under moving feet, new starts."""
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from slomo.errors import StageFailed
-from slomo.optimize import ddp
-from slomo.optimize.cost import Task, leg_violation
+from slomo.optimize import constraints, ddp
+from slomo.optimize.closing import end_gap, end_penalty
+from slomo.optimize.cost import Task, cone, cone_penalty
 from slomo.optimize.dynamics import Body
+from slomo.optimize.iterate import Iterate, Work
 from slomo.pointfoot import PointFootModel
 from slomo.terrain import Terrain
 
 Array = np.ndarray
+Report = Callable[[float, str], None]
+
+LOADED = 1.0  # N, a point is in contact during a step when its normal force exceeds this
+_PENALTY_MOST = 1e7
+# Gap times force (N m) and gap (m) by which the planes that a solve used may differ from the ground that is there.
+_GROUND_WORK, _GROUND = 1e-5, 1e-4
 
 
 @dataclass(frozen=True)
@@ -24,79 +32,89 @@ class Settings:
         kappas: N m, falling: the homotopy of the contact.
         iterations, early_iterations: most Newton steps at the last kappa, and at each one that leads to it.
         tolerance: of the relative decrease still expected.
-        leg_penalty: 1/m^2, first penalty of the leg limits.  leg_tolerance: m, largest violation accepted.
+        penalty: 1/m^2, first penalty of the constraints.
+        constraint_tolerance: m, largest violation accepted.  cone_tolerance: N, the same of a friction cone.
+        end_tolerance: m, rad, m/s, rad/s, of the end of a cyclic motion.
         rounds: of the augmented Lagrangian (and of moving the ground) at the last kappa.
+        strict: whether loaded points may not slide at all, instead of at a cost.
+        starts: most starts that are tried.
     """
 
     kappas: tuple[float, ...] = (1e-1, 1e-2, 1e-3, 1e-4)
     iterations: int = 200
     early_iterations: int = 50
     tolerance: float = 1e-6
-    leg_penalty: float = 1e4
-    leg_tolerance: float = 1e-5
-    rounds: int = 12
+    penalty: float = 1e4
+    constraint_tolerance: float = 1e-5
+    cone_tolerance: float = 1e-3
+    end_tolerance: float = 1e-7
+    rounds: int = 16
+    strict: bool = False
+    starts: int = 4
 
 
 @dataclass(frozen=True)
 class Solution:
-    """The last iterate, whether it converged or not.
+    """The best iterate, whether it converged or not.
 
     Attributes:
         iterate: states, inputs, contact forces; its dynamics hold to rounding.
-        status: "converged", or why not.  iterations: in all.  cost: of the last problem.
-        leg_violation: m.  seconds: of solving.  compile_seconds: of compiling or loading compiled code before.
+        status: "converged", or why not.  iterations: Newton steps in all.  cost: of the last problem.
+        violation: m, of the constraints.  starts: how many were tried, the last one named by `start`.
+        seconds: of solving.  compile_seconds: of compiling or loading compiled code before.
     """
 
-    iterate: ddp.Iterate
+    iterate: Iterate
     status: str
     iterations: int
     cost: float
-    leg_violation: float
+    violation: float
+    start: str
+    starts: int
     seconds: float
     compile_seconds: float
 
-
-def _violation(body: Body, it: ddp.Iterate) -> Array:
-    out = np.empty((len(it.qs), len(body.leg_min), 2))
-    for k in range(len(it.qs)):
-        leg_violation(body, it.qs[k], out[k])
-    return out
+    @property
+    def converged(self) -> bool:
+        return self.status == ddp.STATUS[ddp.CONVERGED]
 
 
 def warm_up(model: PointFootModel) -> float:
     """Compile (or load from the cache) everything that `solve` calls; returns the seconds that it took."""
-    start = time.perf_counter()
+    began = time.perf_counter()
     C, N = model.C, 2
     nv = 6 + 3 * C
     q = np.zeros((N + 1, nv + 1))
     q[:, 6] = 1.0
     q[:, 2] = model.leg_max.mean()
     q[:, 7:] = (model.hips * [1, 1, 0]).ravel()
+    up = np.tile([0.0, 0.0, 1.0, 0.0], (N + 1, C, 1))
     task = Task(
-        h=np.full(N + 1, 0.01), heights=np.zeros((N + 1, C)), q_ref=q.copy(), v_ref=np.zeros((N + 1, nv)),
+        h=np.full(N + 1, 0.01), ground=up, stick=np.zeros((N, C), bool), q_ref=q.copy(), v_ref=np.zeros((N + 1, nv)),
         u_ref=np.zeros((N, 3 * C)), w_x=np.ones((N + 1, 2 * nv)), w_u=np.ones((N, 3 * C)),
-        w_acceleration=1.0, w_slip=1.0, slip_load=1.0,
+        u_low=np.full((N, 3 * C), -1.0), u_high=np.ones((N, 3 * C)), w_acceleration=1.0, w_slip=1.0, slip_load=1.0,
+        cyclic=False, shift=np.zeros(4),
     )  # fmt: skip
-    it = ddp.Iterate(q, np.zeros((N + 1, nv)), np.zeros((N, 3 * C)), np.zeros((N, C, 3)), np.zeros((N + 1, C, 2)))
-    body, work = Body.of(model), ddp.Work.make(N, C)
+    it = Iterate.at(q, np.zeros((N + 1, nv)), np.zeros((N, 3 * C)), C=C, P=len(model.pairs))
+    body, work = Body.of(model), Work.make(it)
     ddp.solve(body, task, 1.0, it, 1.0, True, 1, 1e-6, 1e-6, work)
     ddp.close(body, task, 1.0, it, work)
-    _violation(body, it)
-    return time.perf_counter() - start
+    _violations(body, task, it)
+    return time.perf_counter() - began
 
 
 def solve(
     model: PointFootModel,
     task: Task,
-    start: ddp.Iterate,
+    start: Iterate,
     *,
     terrain: Terrain,
     settings: Settings | None = None,
-    report: Callable[[float, str], None] = lambda fraction, message: None,
+    report: Report = lambda fraction, message: None,
 ) -> Solution:
-    """Minimise the task's cost from a start (not changed).
+    """Minimise the task's cost from a start (not changed), or from others where that does not converge.
 
-    The iterate that is returned satisfies the dynamics and the input limits whatever the status; leg limits and
+    The iterate that is returned satisfies the dynamics and the input limits whatever the status; the constraints and
     convergence hold when the status is "converged". `report(fraction, message)` is called between the solves.
 
     Raises:
@@ -105,42 +123,132 @@ def solve(
     s = settings or Settings()
     compile_seconds = warm_up(model)
     began = time.perf_counter()
-    body = Body.of(model)
-    it = ddp.Iterate(*(x.copy() for x in start))
-    work = ddp.Work.make(len(it.us), model.C)
-    rho, reg, iterations = s.leg_penalty, 1e-3, 0
-    status, cost, worst = ddp.ITERATIONS, np.inf, np.inf
-    C = model.C
-    previous, moved = np.inf, False
-    for n, kappa in enumerate(s.kappas):
-        last = n == len(s.kappas) - 1
-        most = s.iterations if last else s.early_iterations
+    best: Solution | None = None
+    iterations = 0
+    for n, (name, first, how) in enumerate(_starts(task, start, s)):
+        solution = replace(_descend(model, task, first, terrain, how, report), start=name, starts=n + 1)
+        iterations += solution.iterations
+        if best is None or solution.converged or solution.violation < 0.5 * best.violation:
+            best = replace(solution, starts=n + 1)
+        if solution.converged or n + 1 >= s.starts:
+            break
+        report(0.0, f"start {n + 1} ({name}): {solution.status}; another one")
+    assert best is not None
+    seconds = time.perf_counter() - began
+    return replace(best, starts=n + 1, iterations=iterations, seconds=seconds, compile_seconds=compile_seconds)
+
+
+def _starts(task: Task, start: Iterate, s: Settings) -> Iterator[tuple[str, Iterate, Settings]]:
+    """Starts by name, with the settings for each."""
+    yield "targets", start, s
+    yield "targets, softer contact first", start, replace(s, kappas=(10.0, 1.0, *s.kappas), early_iterations=100)
+    still = start.copy()
+    still.vs[:] = 0.0
+    still.us[:] = 0.5 * (task.u_low + task.u_high)
+    yield "targets, no forces", still, replace(s, kappas=(10.0, 1.0, *s.kappas), penalty=10 * s.penalty)
+    smooth = start.copy()
+    T = len(smooth.qs)
+    for x in (smooth.qs, smooth.vs):
+        padded = np.concatenate([np.repeat(x[:1], 3, axis=0), x, np.repeat(x[-1:], 3, axis=0)])
+        x[:] = sum(padded[i : i + T] for i in range(7)) / 7
+    smooth.qs[:, 3:7] /= np.linalg.norm(smooth.qs[:, 3:7], axis=1, keepdims=True)
+    yield "smoothed targets", smooth, replace(s, kappas=(1.0, *s.kappas), iterations=2 * s.iterations)
+
+
+@dataclass
+class _Multipliers:
+    """Augmented Lagrangian: the penalty grows while the violations do not halve."""
+
+    penalty: float
+    previous: float = np.inf
+
+    def update(self, body: Body, task: Task, it: Iterate, settings: Settings) -> float:
+        """New multipliers in `it`; returns the largest violation relative to its tolerance."""
+        rho = self.penalty
+        g, sliding, end = _violations(body, task, it)
+        equal = np.array([constraints.is_equality(body, n) for n in range(g.shape[1])], bool)
+        worst = max(
+            float(np.where(equal, np.abs(g), g).max(initial=0.0)) / settings.constraint_tolerance,
+            float(sliding.max(initial=0.0)) / settings.cone_tolerance,
+            float(np.abs(end).max(initial=0.0)) / settings.end_tolerance,
+        )
+        it.multiplier[:] = it.multiplier + rho * np.where(np.isfinite(g), g, 0.0)
+        it.multiplier[:] = np.where(equal, it.multiplier, np.maximum(it.multiplier, 0.0))
+        it.cone[:] = np.where(task.stick, np.maximum(0.0, it.cone + cone_penalty(rho) * sliding), 0.0)
+        if task.cyclic:
+            nv = len(end) // 2
+            it.closing[:] += np.array([end_penalty(rho, i, nv) for i in range(2 * nv)]) * end
+        if worst > 0.5 * self.previous and rho < _PENALTY_MOST:
+            self.penalty = 4.0 * rho
+        self.previous = worst
+        return worst
+
+
+def _descend(
+    model: PointFootModel, task: Task, start: Iterate, terrain: Terrain, s: Settings, report: Report
+) -> Solution:
+    """From one start through all kappas, and once more with sticking points where that is asked for."""
+    body, it = Body.of(model), start.copy()
+    work = Work.make(it, cyclic=task.cyclic)
+    multipliers = _Multipliers(s.penalty)
+    reg, iterations, cost, failure = 1e-3, 0, np.inf, ""
+    stages = [(kappa, False) for kappa in s.kappas] + [(s.kappas[-1], True)] * s.strict
+    for n, (kappa, strict) in enumerate(stages):
+        last = n >= len(s.kappas) - 1
         for turn in range(s.rounds if last else 1):
-            report((n + turn / s.rounds) / len(s.kappas), f"kappa {kappa:g} N m, leg limits round {turn + 1}")
+            report((n + turn / s.rounds) / len(stages), f"kappa {kappa:g} N m, constraints round {turn + 1}")
+            if strict:
+                task = task._replace(stick=task.stick | (_normal_forces(task, it) > LOADED))
+            most = s.iterations if last else s.early_iterations
             status, count, cost, _, reg = ddp.solve(
-                body, task, kappa, it, rho, True, most, s.tolerance, max(reg, 1e-6), work
+                body, task, kappa, it, multipliers.penalty, True, most, s.tolerance, max(reg, 1e-6), work
             )
             iterations += count
             if status == ddp.NOT_FINITE:
                 raise StageFailed("met numbers that are not finite", where="optimize", todo="check the key points")
-            g = _violation(body, it)
-            worst = float(max(g.max(), 0.0))
-            heights = terrain.height(it.qs[:, 7:].reshape(-1, C, 3))
-            moved = not np.array_equal(heights, task.heights)
-            if last and worst <= s.leg_tolerance and not moved and status == ddp.CONVERGED:
-                break
-            it.multiplier[:] = np.maximum(0.0, it.multiplier + rho * g)
-            if worst > 0.5 * previous and rho < 1e7:
-                rho *= 4.0
-            previous = worst
+            worst = multipliers.update(body, task, it, s)
+            ground = np.ascontiguousarray(terrain.planes(it.qs[:, 7:].reshape(len(it.qs), -1, 3)))
+            moved = _differs(task, ground, it)
+            new = strict and np.any(_normal_forces(task, it)[~task.stick] > LOADED)
+            failure = "" if status == ddp.CONVERGED else ddp.STATUS[status]
+            if worst > 1.0:
+                failure = failure or f"constraints exceed their tolerance {worst:.1f} times"
             if moved:
-                task = task._replace(heights=np.ascontiguousarray(heights))
+                failure = failure or "feet keep crossing an edge of the terrain"
+                task = task._replace(ground=ground)
+            if last and not failure and not new:
+                break
             reg = min(reg, 1e-3)
     ddp.close(body, task, s.kappas[-1], it, work)
-    worst = float(max(_violation(body, it).max(), 0.0))
-    what = ddp.STATUS[status]
-    if status == ddp.CONVERGED and worst > 10 * s.leg_tolerance:
-        what = f"leg limits exceeded by {1e3 * worst:.2f} mm"
-    elif status == ddp.CONVERGED and moved:
-        what = "feet keep crossing an edge of the terrain"
-    return Solution(it, what, iterations, float(cost), worst, time.perf_counter() - began, compile_seconds)
+    g = _violations(body, task, it)[0]
+    return Solution(
+        it, failure or ddp.STATUS[ddp.CONVERGED], iterations, float(cost), float(g.max(initial=0.0)), "", 0, 0.0, 0.0
+    )
+
+
+def _violations(body: Body, task: Task, it: Iterate) -> tuple[Array, Array, Array]:
+    """Of the constraints (N + 1, M) m, of the cones of sticking points (N, C) N, and of a cyclic end (nx or 0,)."""
+    g = np.empty_like(it.multiplier)
+    for k in range(len(g)):
+        constraints.values(body, it.qs[k], g[k])
+    sliding = np.zeros(task.stick.shape)
+    for k, c in np.argwhere(task.stick):
+        sliding[k, c] = cone(body, task.ground[k + 1, c], it.lam[k, c])
+    end = np.zeros(len(it.closing) if task.cyclic else 0)
+    if task.cyclic:
+        end_gap(task, it.qs[0], it.vs[0], it.qs[-1], it.vs[-1], end)
+    return g, sliding, end
+
+
+def _normal_forces(task: Task, it: Iterate) -> Array:
+    """(N, C) N."""
+    return np.sum(task.ground[1:, :, :3] * it.lam, axis=2)
+
+
+def _differs(task: Task, ground: Array, it: Iterate) -> bool:
+    """Whether planes (N + 1, C, 4) put a point at another height than those of the task, as far as it matters."""
+    points = it.qs[:, 7:].reshape(len(it.qs), -1, 3)
+    change = ground - task.ground
+    gap = np.abs(np.sum(change[..., :3] * points, axis=2) - change[..., 3])
+    work = gap[1:] * np.maximum(_normal_forces(task, it), 0.0)
+    return bool(gap.max() > _GROUND or work.max() > _GROUND_WORK)

@@ -60,7 +60,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     model = PointFootModel.from_robot(robot, mu=config.mu)
     want = problem.targets(motion, model, terrain, dt=config.dt)
     task = problem.make_task(model, want, terrain, config)
-    start = problem.make_start(model, want, task.heights)
+    start = problem.make_start(model, want, task)
     progress.update(0.02, "loading the compiled solver (the first run compiles it, which takes half a minute)")
     settings = Settings(
         kappas=(*(k for k in Settings().kappas if k > config.kappa), config.kappa),

@@ -13,6 +13,7 @@ from slomo.motion import Reference
 from slomo.optimize import ddp, so3
 from slomo.optimize.cost import Task
 from slomo.optimize.dynamics import Body, minus
+from slomo.optimize.iterate import Iterate, Work
 from slomo.optimize.jit import compiled
 from slomo.pointfoot import PointFootModel
 from slomo.terrain import Terrain
@@ -21,7 +22,7 @@ Array = np.ndarray
 
 _REG = 1e-6  # first Levenberg-Marquardt factor of every tick: one grown in an earlier tick would freeze the plan
 _DEFECT = 1.0  # l1 norm of the gaps under which an iterate that finds no further descent is a plan
-_LEG_PENALTY = 1e4  # 1/m^2
+_PENALTY = 1e4  # 1/m^2
 
 
 @dataclass(frozen=True)
@@ -180,17 +181,19 @@ class Mpc:
         H, C = c.horizon, model.C
         nv = 6 + 3 * C
         self._body = Body.of(self.model)
-        self._work = ddp.Work.make(H, C)
         w = np.empty((H + 1, 2 * nv))
         w[:, :3], w[:, 3:6] = c.position, c.orientation
         w[:, 6:nv] = np.tile([c.foot, c.foot, c.foot_height], C)
         w[:, nv : nv + 3], w[:, nv + 3 : nv + 6], w[:, nv + 6 :] = c.velocity, c.angular_velocity, c.foot_velocity
         h = np.append(np.full(H, c.dt), c.terminal)
         self._task = Task(
-            h=h, heights=np.zeros((H + 1, C)), q_ref=np.zeros((H + 1, nv + 1)), v_ref=np.zeros((H + 1, nv)),
+            h=h, ground=np.tile([0.0, 0.0, 1.0, 0.0], (H + 1, C, 1)), stick=np.zeros((H, C), bool),
+            q_ref=np.zeros((H + 1, nv + 1)), v_ref=np.zeros((H + 1, nv)),
             u_ref=np.zeros((H, 3 * C)), w_x=w, w_u=np.full((H, 3 * C), c.effort),
-            w_acceleration=c.acceleration, w_slip=c.slip, slip_load=c.slip_load,
+            u_low=np.tile(-model.u_max.ravel(), (H, 1)), u_high=np.tile(model.u_max.ravel(), (H, 1)),
+            w_acceleration=c.acceleration, w_slip=c.slip, slip_load=c.slip_load, cyclic=False, shift=np.zeros(4),
         )  # fmt: skip
+        self._work = Work.make(self._new_iterate())
         r = reference
         self._t_ref, self._q_ref, self._v_ref, self._u_ref = (
             np.ascontiguousarray(x, float) for x in (r.t, r.q, r.v, r.u)
@@ -205,6 +208,10 @@ class Mpc:
         u = np.zeros((self.model.C, 3))
         u[:, 2] = self.model.mass * self.model.g * near / near.sum()
         return u.ravel()
+
+    def _new_iterate(self) -> Iterate:
+        task = self._task
+        return Iterate.at(task.q_ref, task.v_ref, task.u_ref, C=self.model.C, P=len(self.model.pairs))
 
     def reset(self) -> None:
         """Forget the last plan; the next step starts from the reference."""
@@ -238,26 +245,24 @@ class Mpc:
         _sample_all(self._t_ref, self._q_ref, self._v_ref, self._u_ref, knots, task.q_ref, task.v_ref, task.u_ref)
         task.u_ref[knots[1:] > self.reference.t[-1] + 1e-9] = self._hold
         last = self._plan
-        it = ddp.Iterate(
-            task.q_ref.copy(), task.v_ref.copy(), task.u_ref.copy(), np.zeros((H, C, 3)), np.zeros((H + 1, C, 2))
-        )
+        it = self._new_iterate()
         if last is not None:
             # The last plan as far as it reaches; what follows stays at the reference.
             n = int(np.searchsorted(knots, last.t[-1] + 1e-9)) - 1
             if n > 0:
                 _sample_all(last.t, last.q, last.v, last.u, knots[: n + 1], it.qs[: n + 1], it.vs[: n + 1], it.us[:n])
         it.qs[0], it.vs[0] = q, v
-        task.heights[:] = self.terrain.height(it.qs[:, 7:].reshape(H + 1, C, 3))
+        task.ground[:] = self.terrain.planes(it.qs[:, 7:].reshape(H + 1, C, 3))
         status, _, _, defect, _ = ddp.solve(
-            self._body, task, c.kappa, it, _LEG_PENALTY, False, c.iterations, c.tolerance, _REG, self._work
+            self._body, task, c.kappa, it, _PENALTY, False, c.iterations, c.tolerance, _REG, self._work
         )
         failed = status == ddp.NOT_FINITE or (status == ddp.STUCK and not defect < _DEFECT)
         if failed and last is not None:
             plan = replace(last, status=1, seconds=time.perf_counter() - start)
         else:
             plan = Plan(
-                t=knots, q=it.qs, v=it.vs, u=it.us, lam=it.lam, gains=self._work.K.copy(), u_max=self._body.u_max,
-                status=int(failed), defect=float(defect), seconds=time.perf_counter() - start,
+                t=knots, q=it.qs, v=it.vs, u=it.us, lam=it.lam, gains=self._work.K.copy(),
+                u_max=self.model.u_max.ravel(), status=int(failed), defect=float(defect), seconds=time.perf_counter() - start,
             )  # fmt: skip
         self._plan = plan
         return plan
