@@ -261,8 +261,8 @@ class Mpc:
             plan = replace(last, status=1, seconds=time.perf_counter() - start)
         else:
             plan = Plan(
-                t=knots, q=it.qs, v=it.vs, u=it.us, lam=it.lam, gains=self._work.K.copy(),
-                u_max=self.model.u_max.ravel(), status=int(failed), defect=float(defect), seconds=time.perf_counter() - start,
+                t=knots, q=it.qs, v=it.vs, u=it.us, lam=it.lam, gains=self._work.K.copy(), status=int(failed),
+                u_max=self.model.u_max.ravel(), defect=float(defect), seconds=time.perf_counter() - start,
             )  # fmt: skip
         self._plan = plan
         return plan
