@@ -1,5 +1,7 @@
 """From raw key points to smooth ones on a uniform grid: jumps, spikes, gaps."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.linalg import solveh_banded
 from scipy.ndimage import median_filter
@@ -23,13 +25,12 @@ def resample(motion: KeypointMotion, rate: float) -> KeypointMotion:
     c = motion.confidence
     exact = (w == 0)[:, None] * c[after - 1] + (w == 1)[:, None] * c[after]
     between = ((w > 0) & (w < 1))[:, None] * np.minimum(c[after - 1], c[after])
-    return KeypointMotion(
+    return replace(
+        motion,
         t=t,
         positions=blend(motion.positions),
-        names=motion.names,
         confidence=exact + between,
         contact=None if motion.contact is None else blend(motion.contact),
-        contact_names=motion.contact_names,
     )
 
 
@@ -65,37 +66,74 @@ def smooth(x: np.ndarray, weight: np.ndarray, *, dt: float, cutoff: float) -> np
     return y
 
 
+def bridge(motion: KeypointMotion) -> KeypointMotion:
+    """Positions of missing samples (confidence 0) interpolated between the seen ones of the same key point.
+
+    What stands in the file there is arbitrary. A key point that was never seen goes to the middle of the others.
+    """
+    positions = motion.positions.copy()
+    unseen = []
+    for i, c in enumerate(motion.confidence.T):
+        known = np.flatnonzero(c > 0)
+        if not len(known):
+            unseen.append(i)
+        elif len(known) < len(c):
+            for k in range(3):
+                positions[:, i, k] = np.interp(motion.t, motion.t[known], positions[known, i, k])
+    if unseen and len(unseen) < len(motion.names):
+        others = np.setdiff1d(np.arange(len(motion.names)), unseen)
+        positions[:, unseen] = positions[:, others].mean(axis=1, keepdims=True)
+    return replace(motion, positions=positions)
+
+
+def thin(motion: KeypointMotion, rate: float) -> KeypointMotion:
+    """Averages over 1/rate s, weighted by confidence, of a motion that is sampled at twice `rate` (Hz) or more.
+
+    Without it, interpolation onto the slower grid would throw samples away instead of averaging their noise.
+    """
+    n = round((len(motion.t) - 1) / float(motion.t[-1] - motion.t[0]) / rate)
+    if n < 2:
+        return motion
+    starts = np.arange(0, len(motion.t), n)
+    count = np.diff(np.append(starts, len(motion.t)))
+
+    def mean(x: np.ndarray) -> np.ndarray:
+        return np.add.reduceat(x, starts, axis=0) / count.reshape(-1, *(1,) * (x.ndim - 1))
+
+    w = motion.confidence + 1e-9
+    return replace(
+        motion,
+        t=mean(motion.t),
+        positions=mean(w[..., None] * motion.positions) / mean(w)[..., None],
+        confidence=mean(motion.confidence),
+        contact=None if motion.contact is None else mean(motion.contact),
+    )
+
+
 def despike(motion: KeypointMotion, *, size: float, window: float) -> KeypointMotion:
     """Confidence 0 for samples further than `size` from the running median over `window` s."""
-    n = max(3, round(window / (motion.t[1] - motion.t[0])) | 1)
+    n = max(3, round(window / float(np.median(np.diff(motion.t)))) | 1)
     away = np.linalg.norm(motion.positions - median_filter(motion.positions, (n, 1, 1), mode="nearest"), axis=2)
-    return KeypointMotion(
-        t=motion.t,
-        positions=motion.positions,
-        names=motion.names,
-        confidence=np.where(away > size, 0.0, motion.confidence),
-        contact=motion.contact,
-        contact_names=motion.contact_names,
-    )
+    return replace(motion, confidence=np.where(away > size, 0.0, motion.confidence))
+
+
+def runs(on: np.ndarray) -> list[tuple[int, int]]:
+    """(start, end) of the runs of True in (T,), end exclusive."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(int), [0]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def longest_run(good: np.ndarray) -> slice:
     """The longest run of True in `good` (T,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]])))
-    starts, ends = edges[::2], edges[1::2]
-    if not len(starts):
-        return slice(0, 0)
-    k = int(np.argmax(ends - starts))
-    return slice(int(starts[k]), int(ends[k]))
+    return slice(*max(runs(good), key=lambda r: r[1] - r[0], default=(0, 0)))
 
 
 def cut(motion: KeypointMotion, keep: slice) -> KeypointMotion:
     """The frames in `keep`, times unchanged."""
-    return KeypointMotion(
+    return replace(
+        motion,
         t=motion.t[keep],
         positions=motion.positions[keep],
-        names=motion.names,
         confidence=motion.confidence[keep],
         contact=None if motion.contact is None else motion.contact[keep],
-        contact_names=motion.contact_names,
     )

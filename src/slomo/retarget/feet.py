@@ -1,45 +1,88 @@
 """Feet that stand still while they stand: ground drift, stance detection, leg odometry, anchoring."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, median_filter, minimum_filter1d
 
-Intervals = list[tuple[int, int]]
+from slomo.retarget.clean import runs
+
+_HELD = 0.3  # of the legs' length: a foot whose floor is this much higher than the other one's of its pair never stands
+_REARED = 0.5  # the same for a pair whose floor is higher than the other pair's, which a tilted camera also gives
+
+
+@dataclass(frozen=True)
+class Lifts:
+    """Feet over the ground.
+
+    Attributes:
+        lift: (T, F) m, >= 0.
+        ground: (T,) m, the mean ground's height in the input's frame.
+        held: (F,) bool, feet that are in the air throughout.
+    """
+
+    lift: np.ndarray
+    ground: np.ndarray
+    held: np.ndarray
 
 
 def lifts(
-    height: np.ndarray, pairs: tuple[tuple[int, ...], ...], *, dt: float, window: float, most: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Height of each foot over the ground, and how the ground itself seems to rise and sink.
+    height: np.ndarray,
+    known: np.ndarray,
+    pairs: tuple[tuple[int, ...], ...],
+    *,
+    dt: float,
+    window: float,
+    leg: float,
+    most: float = 0.3,
+) -> Lifts:
+    """Height of each foot over the ground, while the ground itself seems to rise and sink.
 
-    Each foot has a floor of its own (its 15th percentile: key points sit at different heights in different paws). With
-    one camera the ground also drifts and tilts over the clip: some foot of each pair stands within any `window`, so the
-    lower envelope of a pair is the ground there, unless it is higher than drift can be (both front feet of a creature
-    that rears).
+    Each foot has a floor of its own (its 15th percentile: key points sit at different heights in different paws),
+    unless that is so high over the others' that the foot is held up throughout. With one camera the ground also drifts
+    and tilts over the clip: some foot of each pair stands within any `window`, so the lower envelope of a pair is the
+    ground there, unless it is higher than drift can be (both front feet of a creature that rears).
 
     Args:
-        height: (T, F) m.  pairs: columns of the front and of the hind feet.
-        dt: s.  window: s, longer than any flight phase.  most: m, greatest drift.
-
-    Returns:
-        (T, F) m over the ground, >= 0, and (T,) m, the mean ground's height in the input's frame.
+        height: (T, F) m.  known: (F,) bool, feet that were seen.  pairs: columns that stand in turn.
+        dt: s.  window: s, longer than any flight phase.
+        leg: m, height of the body over the feet.  most: of `leg`, greatest drift.
     """
     floor = np.percentile(height, 15, axis=0)
+    held = _held(floor, known, pairs, leg=leg)
+    floor = np.where(held, floor[known & ~held].min(), floor)
     over = height - floor
     n = max(1, round(window / dt)) | 1
     ground = np.zeros_like(over)
+    grounds = []
     for pair in pairs:
-        low = minimum_filter1d(over[:, list(pair)].min(axis=1), n, mode="nearest")
-        low = gaussian_filter1d(np.where(np.abs(low) > most, 0.0, low), window / dt / 2, mode="nearest")
-        ground[:, list(pair)] = low[:, None]
+        stands = [f for f in pair if known[f] and not held[f]]
+        if stands:
+            low = minimum_filter1d(over[:, stands].min(axis=1), n, mode="nearest")
+            low = gaussian_filter1d(np.where(np.abs(low) > most * leg, 0.0, low), window / dt / 2, mode="nearest")
+            ground[:, list(pair)] = low[:, None]
+            grounds.append(low)
     over = over - ground
-    rest = np.percentile(over, 15, axis=0)
-    return np.maximum(over - rest, 0), ground.mean(axis=1) + float(np.median(floor + rest))
+    rest = np.where(held, 0.0, np.percentile(over, 15, axis=0))
+    level = float(np.median((floor + rest)[known & ~held]))
+    return Lifts(np.maximum(over - rest, 0), np.mean(grounds, axis=0) + level, held)
+
+
+def _held(floor: np.ndarray, known: np.ndarray, pairs: tuple[tuple[int, ...], ...], *, leg: float) -> np.ndarray:
+    """(F,) bool: feet whose floor is too high over that of the other one, or of the other pair."""
+    held = np.zeros(len(floor), bool)
+    lowest = {pair: min((floor[f] for f in pair if known[f]), default=np.inf) for pair in pairs}
+    for pair, low in lowest.items():
+        for f in pair:
+            held[f] = known[f] and (floor[f] - low > _HELD * leg or low - min(lowest.values()) > _REARED * leg)
+    return held
 
 
 def stance(lift: np.ndarray, speed: np.ndarray, *, dt: float, clearance: float, shortest: float) -> np.ndarray:
     """Which feet stand, without any assumption about the gait.
 
-    A foot stands when it is low and slow. Slow is relative to the same foot's swing, because reconstructed feet slide.
+    A foot stands when it is low and slow. Slow is relative to the same foot's swing, because reconstructed feet slide,
+    and to its own slowest quarter, because noise moves a foot that never swings.
 
     Args:
         lift: (T, F) m over the foot's floor.  speed: (T, F) m/s, horizontal.
@@ -48,8 +91,8 @@ def stance(lift: np.ndarray, speed: np.ndarray, *, dt: float, clearance: float, 
     Returns:
         (T, F) bool.
     """
-    swing = np.percentile(speed, 95, axis=0)
-    slow = speed < np.maximum(0.35 * swing, 0.12)
+    noise, swing = np.percentile(speed, [25, 95], axis=0)
+    slow = speed < np.maximum(np.maximum(0.35 * swing, np.minimum(3 * noise, 0.6 * swing)), 0.12)
     return settled(slow & (lift < clearance), dt=dt, shortest=shortest)
 
 
@@ -57,12 +100,6 @@ def settled(standing: np.ndarray, *, dt: float, shortest: float) -> np.ndarray:
     """(T, F) bool without stances and swings shorter than `shortest` (s)."""
     n = 2 * round(shortest / dt) | 1
     return median_filter(standing.astype(np.uint8), (n, 1), mode="nearest").astype(bool)
-
-
-def runs(standing: np.ndarray) -> Intervals:
-    """(start, end) of the runs of True in (T,), end exclusive."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], standing.astype(int), [0]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def slide(xy: np.ndarray, weight: np.ndarray, *, dt: float, smoothing: float) -> np.ndarray:
@@ -128,23 +165,23 @@ def split(xy: np.ndarray, standing: np.ndarray, *, dt: float, tolerance: float, 
     return out
 
 
-def anchor(xy: np.ndarray, standing: np.ndarray) -> np.ndarray:
+def anchor(x: np.ndarray, standing: np.ndarray) -> np.ndarray:
     """One place for each stance; what that moves is blended over the swings before and after.
 
     Args:
-        xy: (T, 2) m, path of one foot.  standing: (T,) bool.
+        x: (T, D), path of one foot (m) or where it points (rad, continuous).  standing: (T,) bool.
 
     Returns:
-        (T, 2), constant over each stance.
+        (T, D), constant over each stance.
     """
-    shift, known = np.zeros_like(xy), np.zeros(len(xy), bool)
+    shift, known = np.zeros_like(x), np.zeros(len(x), bool)
     for start, end in runs(standing):
-        shift[start:end] = np.median(xy[start:end], axis=0) - xy[start:end]
+        shift[start:end] = np.median(x[start:end], axis=0) - x[start:end]
         known[start:end] = True
     if not known.any():
-        return xy.copy()
-    frames = np.arange(len(xy))
-    return xy + np.stack([np.interp(frames, frames[known], shift[known, c]) for c in range(2)], axis=1)
+        return x.copy()
+    frames = np.arange(len(x))
+    return x + np.stack([np.interp(frames, frames[known], column[known]) for column in shift.T], axis=1)
 
 
 def clear(lift: np.ndarray, standing: np.ndarray, *, least: float) -> np.ndarray:

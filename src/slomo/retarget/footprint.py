@@ -1,59 +1,111 @@
-"""Where the robot's feet and body go: under its hips, within reach, from the origin, on a step."""
+"""Where the robot's soles go: under its hips, within reach of strides, from the origin, on a step."""
+
+from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from slomo.errors import InvalidData, UsageError
+from slomo.retarget.soles import RobotBody
 from slomo.retarget.trunk import Trunk
-from slomo.robot import Robot
+from slomo.rotation import rot_z
 from slomo.terrain import Box, Terrain
 
+Array = np.ndarray
+_LEVEL = 0.5  # rad, a body tilted less stands as usual
 
-def footprint(
-    xy: np.ndarray, base: np.ndarray, yaw: np.ndarray, standing: np.ndarray, robot: Robot
-) -> tuple[np.ndarray, np.ndarray, float]:
+
+@dataclass(frozen=True)
+class Footprint:
+    """Paths on the ground: soles (T, S, 2) m and body (T, 2) m, and the stride scale."""
+
+    soles: Array
+    body: Array
+    stride: float
+
+
+def footprint(xy: Array, base: Array, trunk: Trunk, standing: Array, body: RobotBody) -> Footprint:
     """Stance width and length of the robot, strides of the creature, shortened where legs would not reach.
 
-    Each foot is shifted by a constant in the heading frame, so that its median stance place lies under the robot's hip.
-    One factor on the path of body and feet alike keeps standing feet standing.
+    Each sole is shifted by a constant in the heading frame: a paw so that its median stance place lies under the
+    robot's hip, a foot sideways only as far as keeps it from the other one (a person's stance opens and closes). A sole
+    that never stands while the body is level keeps its place along the body. One factor on the path of body and soles
+    alike keeps standing soles standing.
+
+    Args:
+        xy: (T, S, 2), base: (T, 2) m, in the robot's size.  standing: (T, S) bool.
     """
-    c, s = np.cos(yaw), np.sin(yaw)
-    R = np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
+    R = rot_z(trunk.heading)[:, :2, :2]
     relative = np.einsum("tji,tfj->tfi", R, xy - base[:, None])
-    centre = np.stack(
-        [np.median(x[on] if on.any() else x, axis=0) for x, on in zip(relative.swapaxes(0, 1), standing.T, strict=True)]
-    )
-    excursion = float(np.percentile(np.linalg.norm(relative - centre, axis=2), 95))
-    length = 0.95 * float(robot.leg_reach[:, 1].min())
-    room = 0.8 * np.sqrt(max(length**2 - robot.standing_height**2, 0.0))
+    home = body.home - body.root[:2]
+    level = (np.linalg.norm(trunk.tilt, axis=1) < _LEVEL)[:, None] & standing
+    centre = np.empty_like(home)
+    for f, x in enumerate(relative.swapaxes(0, 1)):
+        on = level[:, f] if level[:, f].any() else standing[:, f]
+        stances = x[on] if on.any() else x
+        centre[f] = np.median(stances, axis=0)
+        if body.length:
+            side = np.sign(home[f, 1])
+            centre[f, 1] = side * min(np.percentile(side * stances[:, 1], 10), abs(home[f, 1]))
+    free = ~level.any(axis=0)
+    used = ~free if not free.all() else standing.any(axis=0) | free
+    away = np.linalg.norm(relative - centre, axis=2)[:, used]
+    excursion = float(np.percentile(away, 95))
+    length = 0.95 * float(body.reach[:, 1].min())
+    # A long-legged posture is lowered rather than kept from striding.
+    room = 0.8 * np.sqrt(length**2 - min(body.leg, 0.9 * length) ** 2)
     stride = min(1.0, room / excursion) if excursion > 0 else 1.0
-    shift = robot.nominal_hips[:, :2] - stride * centre
-    return stride * xy + np.einsum("tij,fj->tfi", R, shift), stride * base, stride
+    shift = home - stride * centre
+    shift[free, 0] = 0.0
+    return Footprint(stride * xy + np.einsum("tij,fj->tfi", R, shift), stride * base, stride)
 
 
-def start_at_origin(xy: np.ndarray, base: np.ndarray, trunk: Trunk) -> tuple[np.ndarray, np.ndarray, Trunk]:
+def start_at_origin(paths: Footprint, trunk: Trunk) -> tuple[Footprint, Trunk]:
     """The robot starts at the origin and looks along x."""
-    c, s = np.cos(trunk.yaw[0]), np.sin(trunk.yaw[0])
-    R = np.array([[c, s], [-s, c]])
-    moved = Trunk(origin=trunk.origin, yaw=trunk.yaw - trunk.yaw[0], pitch=trunk.pitch, roll=trunk.roll)
-    return (xy - base[0]) @ R.T, (base - base[0]) @ R.T, moved
+    turn = -trunk.heading[0]
+    R = rot_z(turn)[:2, :2]
+    start = paths.body[0]
+    moved = Trunk(origin=trunk.origin, rotation=Rotation.from_euler("z", turn) * trunk.rotation)
+    return Footprint((paths.soles - start) @ R.T, (paths.body - start) @ R.T, paths.stride), moved
 
 
-def make_terrain(xy: np.ndarray, robot: Robot, *, step_height: float, step_limbs: tuple[str, ...]) -> Terrain:
-    """A step in front of the feet that stand on the ground and under those that stand on it."""
-    if step_height == 0:
+def on_step(body: RobotBody, limbs: tuple[str, ...], names: tuple[str, ...]) -> Array:
+    """(S,) bool: soles that stand on the step; `names` are the robot's limbs. Raises `UsageError`."""
+    if not limbs or any(n not in (*names, *body.soles) for n in limbs):
+        raise UsageError(
+            f"no limb {[n for n in limbs if n not in names]}", where="retarget.step_limbs", valid=(*names, *body.soles)
+        )
+    return np.array(
+        [s in limbs or any(names[c] in limbs for c in p) for s, p in zip(body.soles, body.points, strict=True)]
+    )
+
+
+def make_terrain(xy: Array, on: Array, *, height: float) -> Terrain:
+    """A step of `height` (m) under the soles `on` (S,), its edge midway between them and the others.
+
+    Below 0 the step goes down: the others stand on a box. Raises `InvalidData` where no straight edge parts the two.
+    """
+    if height == 0:
         return Terrain()
-    unknown = [n for n in step_limbs if n not in robot.limb_names]
-    if unknown or not step_limbs:
-        raise UsageError(f"no limb {unknown or step_limbs}", where="retarget.step_limbs", valid=robot.limb_names)
-    on = np.array([n in step_limbs for n in robot.limb_names])
-    behind = float(xy[:, ~on, 0].max())
-    ahead = float(xy[:, on, 0].min())
-    if ahead - behind < 0.06:
+    if height < 0:
+        on, height = ~on, -height
+    if on.all() or not on.any():
+        raise InvalidData("a step needs feet on it and feet off it", where="retarget.step_limbs")
+    gaps = []
+    for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
+        behind, ahead = float((sign * xy[:, ~on, axis]).max()), float((sign * xy[:, on, axis]).min())
+        gaps.append((ahead - behind, axis, sign, (behind + ahead) / 2))
+    gap, axis, sign, edge = max(gaps)
+    if gap < 0.06:
         raise InvalidData(
-            f"a step under {', '.join(step_limbs)} does not fit: feet off it reach x = {behind:.2f} m and "
-            f"feet on it come back to {ahead:.2f} m", where="retarget.step_height",
-            todo="choose a part with --set retarget.start=... and retarget.end=...",
+            f"a step does not fit: feet on it and feet off it overlap, by {-gap:.2f} m or more in every direction"
+            if gap < 0
+            else f"a step does not fit: feet on it and feet off it come as near as {gap:.2f} m",
+            where="retarget.step_height", todo="choose a part with --set retarget.start=... and retarget.end=...",
         )  # fmt: skip
-    edge = (behind + ahead) / 2
-    far, wide = float(xy[..., 0].max()) + 0.5, float(np.abs(xy[..., 1]).max()) + 0.5
-    return Terrain((Box(edge, far, -wide, wide, step_height),))
+    low, high = xy.min(axis=(0, 1)) - 0.5, xy.max(axis=(0, 1)) + 0.5
+    if sign > 0:
+        low[axis] = edge
+    else:
+        high[axis] = -edge
+    return Terrain((Box(float(low[0]), float(high[0]), float(low[1]), float(high[1]), height),))
