@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from slomo.errors import InvalidData, UsageError
 from slomo.motion import KeypointMotion, Reference
 from slomo.optimize import problem, stage
-from slomo.optimize.verify import joint_torque_ratio, verify
 from slomo.pointfoot import PointFootModel
 from slomo.robot import load_robot
 from slomo.stage import Artifact, Inputs, Silent
@@ -91,7 +90,7 @@ def test_trot_verifies(result, reference):
     assert report["dynamics_residual"] < 1e-6
     assert report["complementarity"] <= 1e-4
     assert report["penetration"] < 1e-3
-    assert report["slip_per_second"] < 0.02
+    assert report["slip_per_second"] < 0.01
     assert report["torque_ratio"] < 1
     assert report["body_error"] < 0.02
     assert report["foot_error"] < 0.03
@@ -108,72 +107,6 @@ def test_the_same_input_gives_the_same_output(result):
     again = optimize(trot())
     for name, array in result.npz["reference.npz"].items():
         assert np.array_equal(array, again.npz["reference.npz"][name]), name
-
-
-def tamper(reference, **changes):
-    arrays = {k: np.array(v) for k, v in reference.to_arrays().items()}
-    for name, edit in changes.items():
-        edit(arrays[name])
-    return Reference.from_arrays(arrays)
-
-
-def _add(index, value):
-    def edit(x):
-        x[index] += value
-
-    return edit
-
-
-def _set(index, value):
-    def edit(x):
-        x[index] = value
-
-    return edit
-
-
-@pytest.mark.parametrize(
-    ("check", "changes"),
-    [
-        ("dynamics_residual", {"u": _add((4, 2), 0.01)}),
-        ("dynamics_residual", {"lam": _add((4, 1, 0), 0.01)}),
-        ("dynamics_residual", {"v": _add((5, 4), 1e-4)}),
-        ("dynamics_residual", {"q": _add((5, slice(3, 7)), [1e-3, 0, 0, 0])}),
-        ("dynamics_residual", {"q": _add((7, 8), 1e-4)}),
-        ("complementarity", {"lam": _set((slice(None), slice(None), 2), 5.0)}),
-        ("penetration", {"q": _add((slice(None), 9), -0.002)}),
-        ("friction_violation", {"lam": _set((slice(None), slice(None), 1), 40.0)}),
-        ("pull", {"lam": _set((3, 2, 2), -1.0)}),
-        ("slip_per_second", {"q": _add((slice(None), 7), np.linspace(0, 0.2, 21))}),
-        ("input_ratio", {"u": _set((2, 0), 1e3)}),
-        ("torque_ratio", {"u": _set((2, slice(0, 3)), [90.0, 90.0, 190.0])}),
-        ("leg_length", {"q": _add((6, 2), 0.2)}),
-    ],
-)
-def test_the_verifier_catches(reference, check, changes):
-    assert verify(MODEL, reference, terrain=Terrain(), robot=ROBOT)[check].holds
-    checks = verify(MODEL, tamper(reference, **changes), terrain=Terrain(), robot=ROBOT)
-    assert not checks[check].holds
-
-
-def test_the_verifier_sees_the_ground_that_is_there(reference):
-    checks = verify(MODEL, reference, terrain=Terrain((Box(-9, 9, -9, 9, 0.05),)))
-    assert checks["penetration"].value == pytest.approx(0.05, abs=1e-3)
-
-
-def test_joint_torques_of_standing():
-    """Standing on four feet, each leg's J^T u is the statics that the joints feel."""
-    q = np.concatenate(
-        [[0, 0, ROBOT.standing_height], [0, 0, 0, 1], (ROBOT.nominal_feet + [0, 0, ROBOT.standing_height]).ravel()]
-    )
-    u = np.tile([0, 0, MODEL.mass * MODEL.g / 4], 4)
-    standing = Reference(
-        t=np.array([0, 0.1]), h=np.array([0.1]), q=np.stack([q, q]), v=np.zeros((2, 18)), u=u[None],
-        lam=np.zeros((1, 4, 3)), point_names=ROBOT.foot_names, robot_digest="",
-    )  # fmt: skip
-    ratio, miss = joint_torque_ratio(ROBOT, standing)
-    assert miss.max() < 1e-5
-    thigh_to_foot = ROBOT.nominal_feet[0, 0] - ROBOT.nominal_hips[0, 0]
-    assert ratio[0, 1] == pytest.approx(abs(thigh_to_foot) * u[2] / ROBOT.effort[1], rel=1e-3)
 
 
 def test_a_step_under_the_front_feet():

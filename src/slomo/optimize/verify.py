@@ -1,95 +1,90 @@
 """Checks a reference against the model's equations and limits. Shares no code with the solver: plain NumPy.
 
-Every check is a number with a limit; `Check.holds` is a comparison. Forces, gaps and slips of step k are judged where
-the step ends, at knot k + 1, which is where an implicit contact model applies its force.
+Every check is a number with a limit, a place and a time; docs/verify.md says why each limit is what it is.
 """
 
-from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports]
 from scipy.spatial.transform import Rotation
 
 from slomo.motion import Reference
+from slomo.optimize.check import Check, worst
+from slomo.optimize.inverse import JointMotion, joint_motion
+from slomo.optimize.verify_ground import ground_checks
 from slomo.pointfoot import PointFootModel
 from slomo.robot import Robot
 from slomo.terrain import Terrain
 
 Array = np.ndarray
 
-LOADED = 1.0  # N, a point is in contact during a step when its normal force exceeds this
+BODY_ERROR, FOOT_ERROR = 0.015, 0.025  # m, means that a robot of a dog's size should keep
 
 
-@dataclass(frozen=True)
-class Check:
-    """The worst value of one quantity, where it is, and what is allowed.
+class Wanted(Protocol):
+    """What was asked for: `problem.Targets`, or anything with the same of its attributes.
 
     Attributes:
-        value, limit: in `unit`; the check holds when value <= limit.
-        t: s, of the worst value.  point: which contact point or part.
+        q: (T, 7 + 3 C), laid out as in `motion.Reference`.
+        body_confidence: (T,).  foot_confidence: (T, C).  points: (T, C, 3) m.
     """
 
-    value: float
-    limit: float
-    unit: str
-    t: float
-    point: str
+    @property
+    def q(self) -> Array: ...
 
     @property
-    def holds(self) -> bool:
-        return bool(self.value <= self.limit)
+    def points(self) -> Array: ...
 
+    @property
+    def body_confidence(self) -> Array: ...
 
-def _worst(values: Array, limit: float, unit: str, t: Array, points: tuple[str, ...]) -> Check:
-    """The largest of values (len(t), len(points)); a value that is not a number is the worst."""
-    x = np.where(np.isfinite(values), values, np.inf)
-    k, c = np.unravel_index(int(np.argmax(x)), x.shape)
-    return Check(float(x[k, c]), limit, unit, float(t[k]), points[c])
+    @property
+    def foot_confidence(self) -> Array: ...
 
 
 def verify(
-    model: PointFootModel, reference: Reference, *, terrain: Terrain, robot: Robot | None = None
+    model: PointFootModel,
+    reference: Reference,
+    *,
+    terrain: Terrain,
+    robot: Robot | None = None,
+    want: Wanted | None = None,
 ) -> dict[str, Check]:
-    """All checks by name; the reference is verified when every one holds.
+    """All checks by name; the reference is verified when every one `holds`.
 
-    dynamics_residual: defect of one semi-implicit step, in m, rad, m/s and rad/s alike.
-    complementarity: gap times normal force, N m.  penetration: m.
-    friction_violation: N, tangential force beyond the cone.  pull: N, negative normal force.
-    slip_per_second: horizontal path of all points together while they are loaded (normal force over 1 N), m per s.
-    input_ratio: |u| / u_max.  leg_length: m beyond the limits.
-    torque_ratio: |J^T u| / limit of the joints (with a robot).
+    dynamics_residual: defect of one semi-implicit step, in m, rad, m/s and rad/s alike, and s of the time axis.
+    Those of `ground_checks`.
+    input_ratio: |u| / u_max.  leg_length: m beyond the limits.  pair_distance: m, toe to heel, off their distance.
+    body_clearance: m by which a point comes too near to the body.
+    With a robot, those of `joint_checks`.  With what was wanted, `body_error` and `foot_error` (warnings): m, mean.
     """
     r, names = reference, model.names
-    body = _dynamics(model, r)
-    t1 = r.t[1:]
-    gap = r.points[..., 2] - terrain.height(r.points)
-    normal, tangent = r.lam[..., 2], np.linalg.norm(r.lam[..., :2], axis=2)
-    path = np.linalg.norm(np.diff(r.points[..., :2], axis=0), axis=2) * (normal > LOADED)
-    fastest = np.unravel_index(int(np.argmax(path)), path.shape)
+    parts = ("body position", "body rotation", "body velocity", *names, "time")
     R = Rotation.from_quat(r.q[:, 3:7])
     hips = r.q[:, None, :3] + np.stack([R.apply(h) for h in model.hips], axis=1)
     leg = np.linalg.norm(hips - r.points, axis=2)
     ratio = np.abs(r.u.reshape(-1, model.C, 3)) / model.u_max
-    checks = {
-        "dynamics_residual": _worst(body, 1e-6, "", t1, ("body position", "body rotation", "body velocity", *names)),
-        "complementarity": _worst(np.abs(gap[1:] * normal), 1e-4, "N m", t1, names),
-        "penetration": _worst(np.maximum(-gap, 0.0), 1e-3, "m", r.t, names),
-        "friction_violation": _worst(np.maximum(tangent - model.mu * normal, 0.0), 1e-6, "N", t1, names),
-        "pull": _worst(np.maximum(-normal, 0.0), 1e-9, "N", t1, names),
-        "slip_per_second": Check(
-            float(path.sum() / (r.t[-1] - r.t[0])), 0.02, "m/s", float(t1[fastest[0]]), names[fastest[1]]
-        ),
-        "input_ratio": _worst(ratio.max(axis=2), 1.0 + 1e-9, "", r.t[:-1], names),
-        "leg_length": _worst(np.maximum(leg - model.leg_max, model.leg_min - leg).clip(0.0), 1e-4, "m", r.t, names),
-    }
+    checks = {"dynamics_residual": worst(dynamics_defect(model, r), 1e-6, "", r.t[1:], parts)}
+    checks |= ground_checks(r.t, r.points, r.lam, terrain=terrain, mu=model.mu, names=names)
+    checks["input_ratio"] = worst(ratio.max(axis=2), 1.0 + 1e-9, "", r.t[:-1], names)
+    checks["leg_length"] = worst(np.maximum(leg - model.leg_max, model.leg_min - leg).clip(0.0), 1e-4, "m", r.t, names)
+    if len(model.pairs):
+        a, b = model.pairs.T
+        off = np.abs(np.linalg.norm(r.points[:, a] - r.points[:, b], axis=2) - model.pair_length)
+        checks["pair_distance"] = worst(off, 1e-3, "m", r.t, tuple(f"{names[i]} to {names[j]}" for i, j in model.pairs))
+    if np.any(np.isfinite(model.clearance)):
+        below = -np.einsum("tji,tcj->tci", R.as_matrix(), r.points - r.q[:, None, :3])[..., 2]
+        checks["body_clearance"] = worst(np.maximum(model.clearance - below, 0.0), 1e-3, "m", r.t, names)
     if robot is not None:
-        ratio, _ = joint_torque_ratio(robot, r)
-        checks["torque_ratio"] = _worst(ratio, 1.0, "", r.t[:-1], robot.joint_names)
+        checks |= joint_checks(robot, r, joint_motion(robot, r))
+    if want is not None:
+        checks |= tracking_checks(r, want, names)
     return checks
 
 
-def _dynamics(model: PointFootModel, r: Reference) -> Array:
-    """(T - 1, 3 + C) defects: body position, rotation and velocities, and each point."""
+def dynamics_defect(model: PointFootModel, r: Reference) -> Array:
+    """(T - 1, 4 + C) defects of the steps: body position, rotation and velocities, each point, and the time axis."""
     C, h = model.C, r.h[:, None]
     q, v, q1, v1 = r.q[:-1], r.v[:-1], r.q[1:], r.v[1:]
     u = r.u.reshape(-1, C, 3)
@@ -109,41 +104,64 @@ def _dynamics(model: PointFootModel, r: Reference) -> Array:
             np.maximum(turn.magnitude(), np.abs(np.linalg.norm(q1[:, 3:7], axis=1) - 1)),
             dv[:, :6].max(axis=1),
             np.maximum(dv[:, 6:], dq).reshape(len(u), C, 3).max(axis=2),
+            np.abs(np.diff(r.t) - r.h),
         ]
     )
 
 
-def joint_torque_ratio(robot: Robot, reference: Reference) -> tuple[Array, Array]:
-    """Quasi-static joint torques |J^T u| over their limits (T - 1, nj), and the distance (T - 1, C) m by which inverse
-    kinematics within the joint limits misses the feet."""
-    model, data = robot.model, robot.model.createData()
-    feet = [model.getFrameId(name) for name in robot.foot_names]
-    root_base = robot_base_in_root(robot)
-    q = robot.q_nominal.copy()
-    ratio = np.zeros((len(reference.u), len(robot.effort)))
-    miss = np.zeros((len(reference.u), len(feet)))
-    for k, u in enumerate(reference.u.reshape(len(reference.u), -1, 3)):
-        x = reference.q[k]
-        T = pin.SE3(Rotation.from_quat(x[3:7]).as_matrix(), x[:3]) * root_base.inverse()
-        q[:7] = pin.SE3ToXYZQUAT(T)
-        for _ in range(30):
-            pin.computeJointJacobians(model, data, q)
-            pin.updateFramePlacements(model, data)
-            errors = np.array([p - data.oMf[f].translation for p, f in zip(reference.points[k], feet, strict=True)])
-            J = np.concatenate(
-                [pin.getFrameJacobian(model, data, f, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)[:3, 6:] for f in feet]
-            )
-            miss[k] = np.linalg.norm(errors, axis=1)
-            if miss[k].max() < 1e-6:
-                break
-            dq = J.T @ np.linalg.solve(J @ J.T + 1e-6 * np.eye(len(J)), errors.ravel())
-            q[7:] = np.clip(q[7:] + np.clip(dq, -0.3, 0.3), robot.lower, robot.upper)
-        ratio[k] = np.abs(J.T @ u.ravel()) / robot.effort
-    return ratio, miss
+def joint_checks(robot: Robot, reference: Reference, motion: JointMotion) -> dict[str, Check]:
+    """The whole robot's limits along a reference.
+
+    torque_ratio: |inverse dynamics' torque| over the effort limit.  speed_ratio: |joint velocity| over its limit.
+    joint_miss: m by which inverse kinematics within the joints' limits misses a point.
+    torque_ratio_static (a warning): |J^T u| alone over the effort limit.
+    """
+    r, names = reference, robot.joint_names
+    return {
+        "torque_ratio": worst(np.abs(motion.tau) / robot.effort, 1.0, "", r.t[:-1], names),
+        "speed_ratio": worst(np.abs(motion.v[:, 6:]) / robot.velocity, 1.0, "", r.t, names),
+        "torque_ratio_static": worst(
+            np.abs(motion.tau_static) / robot.effort, 1.0, "", r.t[:-1], names, required=False
+        ),
+        "joint_miss": worst(motion.miss, 5e-3, "m", r.t, robot.limb_names),
+    }
+
+
+def tracking_checks(reference: Reference, want: Wanted, names: tuple[str, ...]) -> dict[str, Check]:
+    """Warnings: mean distances from what was wanted, weighted by confidence; the place is the largest single one."""
+    body, feet = tracking_errors(reference, want)
+    at_body = worst(body[:, None], 0.0, "m", reference.t, ("body",))
+    at_feet = worst(np.where(want.foot_confidence > 0, feet, 0.0), 0.0, "m", reference.t, names)
+    mean = [_mean(body, want.body_confidence), _mean(feet, want.foot_confidence)]
+    return {
+        "body_error": Check(mean[0], BODY_ERROR, "m", at_body.t, "body", required=False),
+        "foot_error": Check(mean[1], FOOT_ERROR, "m", at_feet.t, at_feet.point, required=False),
+    }
+
+
+def tracking_errors(reference: Reference, want: Wanted) -> tuple[Array, Array]:
+    """Distances (T,) of the body and (T, C) of the points from where they were wanted, m."""
+    body = np.linalg.norm(reference.q[:, :3] - want.q[:, :3], axis=1)
+    return body, np.linalg.norm(reference.points - want.points, axis=2)
+
+
+def tracking_table(reference: Reference, want: Wanted, names: tuple[str, ...]) -> dict[str, dict[str, float]]:
+    """Key point -> `mean` and `max` (m) and the time `t` (s) of the largest; where nothing was known, all 0."""
+    body, feet = tracking_errors(reference, want)
+    columns = {"body": (body, want.body_confidence)}
+    columns |= {n: (feet[:, c], want.foot_confidence[:, c]) for c, n in enumerate(names)}
+    out = {}
+    for name, (distance, confidence) in columns.items():
+        seen = np.where(confidence > 0, distance, 0.0)
+        k = int(np.argmax(seen))
+        out[name] = {"mean": _mean(distance, confidence), "max": float(seen[k]), "t": float(reference.t[k])}
+    return out
+
+
+def _mean(distance: Array, confidence: Array) -> float:
+    return float(np.sum(confidence * distance) / max(np.sum(confidence), 1e-12))
 
 
 def robot_base_in_root(robot: Robot) -> pin.SE3:
     """Placement of the base frame in the free-flyer's frame."""
-    data = robot.model.createData()
-    pin.framesForwardKinematics(robot.model, data, robot.q_nominal)
-    return data.oMi[1].inverse() * data.oMf[robot.model.getFrameId(robot.base)]
+    return robot.model.frames[robot.model.getFrameId(robot.base)].placement

@@ -1,0 +1,280 @@
+"""The verifier: a good reference, then the same a little spoilt, so that one check after the other fails alone."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from references import carrying, follow, standing
+from slomo.motion import Reference
+from slomo.optimize.check import as_report, failure
+from slomo.optimize.inverse import joint_motion
+from slomo.optimize.sequence import contact_sequence
+from slomo.optimize.verify import tracking_table, verify
+from slomo.pointfoot import PointFootModel
+from slomo.robot import load_robot
+from slomo.terrain import Box, HeightField, Slope, Terrain
+
+ROBOT = load_robot("go1")
+MODEL = PointFootModel.from_robot(ROBOT)
+FLAT = Terrain()
+BODY = np.array([0.0, 0.0, ROBOT.standing_height, 0, 0, 0, 1])
+FEET = ROBOT.nominal_feet * [1, 1, 0]
+REST = standing(MODEL, BODY, FEET)
+LEG = np.linalg.norm(ROBOT.nominal_hips + BODY[:3] - FEET, axis=1)
+LEFT, RIGHT, HIND_LEFT = 0, 1, 2
+
+
+def spoilt(points=None, lam=None) -> Reference:
+    """Standing, with edits of the points and forces; the dynamics still hold."""
+    p, f = REST.points.copy(), REST.lam.copy()
+    if points:
+        points(p)
+    if lam:
+        lam(f)
+    return follow(MODEL, REST.h, p, f, body=BODY)
+
+
+def lifted(height: float) -> Reference:
+    """The front left foot bears nothing in the last step and ends at that height (m)."""
+
+    def points(p):
+        p[-1, LEFT, 2] = height
+
+    def lam(f):
+        f[-1] = carrying(MODEL, BODY[:3], FEET, on=[False, True, True, True])
+
+    return spoilt(points, lam)
+
+
+def edited(name: str, index, change) -> Reference:
+    """Standing, with one array changed and nothing else."""
+    arrays = {k: np.array(v) for k, v in REST.to_arrays().items()}
+    arrays[name][index] += change
+    return Reference.from_arrays(arrays)
+
+
+def failing(model, reference, terrain=FLAT, robot=ROBOT) -> list[str]:
+    return [n for n, c in verify(model, reference, terrain=terrain, robot=robot).items() if not c.holds]
+
+
+@dataclass
+class Case:
+    """`reference` fails `check` alone, at `point` and t[knot]; `REST` passes with the same model and robot."""
+
+    check: str
+    reference: Reference
+    knot: int
+    point: str
+    model: PointFootModel = MODEL
+    robot: object = ROBOT
+
+
+def weak_knees() -> np.ndarray:
+    """(12,) N m: the knees have a little more than standing needs."""
+    needs = 1.05 * np.abs(joint_motion(ROBOT, REST).tau).max(axis=0)
+    return np.where(["calf" in n for n in ROBOT.joint_names], needs, ROBOT.effort)
+
+
+def _raise_one(p):
+    p[7, LEFT, 2] = 1e-5
+
+
+def _sideways(p):
+    p[7, LEFT, 1] += 1.5e-3
+
+
+def _creep(p):
+    p[1:-1:2, LEFT, 0] += 1e-3
+    p[7, LEFT, 0] += 1e-3
+
+
+def _drag(f):
+    push = 1.1 * MODEL.mu * f[9, LEFT, 2]
+    f[9, LEFT, 0], f[9, HIND_LEFT, 0] = push, -push  # along one line: the body feels nothing
+    f[9, HIND_LEFT, 2] *= 1.2
+
+
+def _stamp(f):
+    f[-1, LEFT, 2] *= 1.3
+
+
+def _pull(f):
+    f[-1] = carrying(MODEL, BODY[:3], FEET, on=[False, True, True, True])
+    f[-1, LEFT, 2] = -0.5
+
+
+CASES = {
+    "an input": Case("dynamics_residual", edited("u", (4, 2), 0.01), 5, "front_left"),
+    "a contact force": Case("dynamics_residual", edited("lam", (4, 1, 0), 0.01), 5, "front_right"),
+    "a body speed": Case("dynamics_residual", edited("v", (-1, 4), 1e-4), -1, "body velocity"),
+    "a body place": Case("dynamics_residual", edited("q", (-1, 0), 1e-4), -1, "body position"),
+    "a quaternion's length": Case("dynamics_residual", edited("q", (-1, 6), 1e-3), -1, "body rotation"),
+    "a foot's place": Case("dynamics_residual", edited("q", (-1, 8), 1e-4), -1, "front_left"),
+    "a time": Case("dynamics_residual", edited("t", -1, 1e-3), -1, "time"),
+    "a step length": Case("dynamics_residual", edited("h", 8, 1e-4), 9, "time"),
+    "force at a gap": Case("complementarity", spoilt(_raise_one), 7, "front_left"),
+    "a foot in the ground": Case("penetration", lifted(-0.002), -1, "front_left"),
+    "a foot outside of its cone": Case("friction_violation", spoilt(lam=_drag), 10, "front_left"),
+    "a sticky foot": Case("pull", spoilt(lam=_pull), -1, "front_left"),
+    "a creeping foot": Case("slip_per_second", spoilt(_creep), 7, "front_left"),
+    "a strong leg": Case(
+        "input_ratio", spoilt(lam=_stamp), -2, "front_left",
+        model=replace(MODEL, u_max=1.05 * np.abs(REST.u).max(axis=0).reshape(4, 3) + 1),
+    ),
+    "a short leg": Case("leg_length", lifted(0.003), -1, "front_left", model=replace(MODEL, leg_min=LEG - 1e-3)),
+    "toe and heel": Case(
+        "pair_distance", spoilt(_sideways), 7, "front_left to front_right",
+        model=replace(MODEL, pairs=[[0, 1]], pair_length=[FEET[0, 1] - FEET[1, 1]]),
+    ),
+    "a foot at the belly": Case(
+        "body_clearance", lifted(0.003), -1, "front_left", model=replace(MODEL, clearance=np.full(4, BODY[2] - 1e-3))
+    ),
+    "a weak motor": Case(
+        "torque_ratio", spoilt(lam=_stamp), -2, "FL_calf_joint", robot=replace(ROBOT, effort=weak_knees())
+    ),
+    "a slow motor": Case(
+        "speed_ratio", lifted(0.003), -1, "FL_calf_joint", robot=replace(ROBOT, velocity=np.full(12, 0.3))
+    ),
+    "narrow joints": Case(
+        "joint_miss", lifted(0.02), -1, "front_left",
+        robot=replace(ROBOT, lower=ROBOT.q_nominal[7:] - 0.02, upper=ROBOT.q_nominal[7:] + 0.02),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
+def test_one_flaw_fails_one_check(case):
+    assert failing(case.model, REST, robot=case.robot) == []
+    checks = verify(case.model, case.reference, terrain=FLAT, robot=case.robot)
+    assert [n for n, c in checks.items() if not c.holds] == [case.check]
+    worst = checks[case.check]
+    assert worst.point == case.point
+    assert worst.t == pytest.approx(case.reference.t[case.knot])
+    report, line = as_report(checks), failure(checks)
+    assert report["verified"] is False
+    assert report["worst"]["check"] == case.check
+    assert line is not None
+    assert f"{case.check} " in line
+    assert f"({case.point}, t = {worst.t:.2f} s)" in line
+
+
+def test_every_required_check_has_a_flaw():
+    model = replace(MODEL, pairs=[[0, 1]], pair_length=[FEET[0, 1] - FEET[1, 1]], clearance=np.zeros(4))
+    checks = verify(model, REST, terrain=FLAT, robot=ROBOT, want=Wanted())
+    assert {n for n, c in checks.items() if c.required} == {case.check for case in CASES.values()}
+
+
+def test_standing_is_verified():
+    checks = verify(MODEL, REST, terrain=FLAT, robot=ROBOT)
+    assert failure(checks) is None
+    assert as_report(checks)["verified"] is True
+
+
+class Wanted:
+    """What was wanted: `REST`, moved."""
+
+    def __init__(self, body=0.0, left=0.0):
+        self.q = REST.q.copy()
+        self.q[5:9, 0] += body
+        self.q[:, 7] += left
+        self.body_confidence, self.foot_confidence = np.ones(21), np.ones((21, 4))
+
+    @property
+    def points(self):
+        return self.q[:, 7:].reshape(21, 4, 3)
+
+
+def test_poor_tracking_is_a_warning():
+    for want, name, point, value in (
+        (Wanted(body=0.1), "body_error", "body", 0.4 / 21),
+        (Wanted(left=0.12), "foot_error", "front_left", 0.03),
+    ):
+        checks = verify(MODEL, REST, terrain=FLAT, want=want)
+        assert [n for n, c in checks.items() if not c.kept] == [name]
+        assert checks[name].value == pytest.approx(value)
+        assert checks[name].point == point
+        assert failure(checks) is None
+        assert as_report(checks)["verified"] is True
+    table = tracking_table(REST, Wanted(body=0.1, left=0.12), MODEL.names)
+    assert table["body"] == {"mean": pytest.approx(0.4 / 21), "max": pytest.approx(0.1), "t": pytest.approx(0.25)}
+    assert table["front_left"]["mean"] == pytest.approx(0.12)
+    assert table["hind_right"]["max"] == 0
+
+
+def test_what_was_not_seen_is_not_judged():
+    want = Wanted(left=0.12)
+    want.foot_confidence[:, LEFT] = 0
+    assert verify(MODEL, REST, terrain=FLAT, want=want)["foot_error"].value == 0
+
+
+def test_the_ground_that_is_there():
+    raised = Terrain((Box(-9, 9, -9, 9, 0.05),))
+    assert verify(MODEL, REST, terrain=raised)["penetration"].value == pytest.approx(0.05)
+    pit = Terrain(slopes=(Slope(-9, 9, -9, 9, height=-0.05),))
+    checks = verify(MODEL, REST, terrain=pit)
+    assert checks["penetration"].value == 0
+    assert checks["complementarity"].value == pytest.approx(0.05 * REST.lam[..., 2].max())
+
+
+def test_gap_force_and_friction_on_a_slope():
+    """Standing on a slope: gaps and normal forces are along its normal, and gravity needs friction of its slope."""
+    slope = 0.3
+    ground = Terrain(slopes=(Slope(-9, 9, -9, 9, height=-9 * slope, slope_x=slope),))
+    points = FEET + [0, 0, 1] * (slope * FEET[:, :1])
+    assert np.allclose(ground.height(points), points[:, 2])
+    rest = standing(MODEL, BODY, points)
+    assert failing(MODEL, rest, terrain=ground, robot=None) == []
+    slippery = verify(replace(MODEL, mu=slope - 1e-3), rest, terrain=ground)
+    load = rest.lam[..., 2].max() / np.hypot(1, slope)
+    assert slippery["friction_violation"].value == pytest.approx(1e-3 * load, rel=1e-6)
+    assert failing(replace(MODEL, mu=slope + 1e-9), rest, terrain=ground, robot=None) == []
+    off = standing(MODEL, BODY, points - [0, 0, 0.01])
+    assert verify(MODEL, off, terrain=ground)["penetration"].value == pytest.approx(0.01 / np.hypot(1, slope))
+
+
+def test_a_height_field_is_ground_too():
+    grid = np.full((9, 9), 0.02)
+    ground = Terrain(field=HeightField(-2, -2, 0.5, tuple(map(tuple, grid))))
+    assert failing(MODEL, standing(MODEL, BODY, FEET + [0, 0, 0.02]), terrain=ground, robot=None) == []
+    assert verify(MODEL, REST, terrain=ground)["penetration"].value == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize(("rise", "depth"), [(0.1, 0.05), (0.02, 0.01)])
+def test_a_corner_cut_between_knots_is_a_warning(rise, depth):
+    """The last step takes the foot through the edge of a box, half of it under the top and the wall far behind."""
+    edge = FEET[LEFT, 0] + 0.001
+    ground = Terrain((Box(edge, edge + 2, 0, 2, rise),))
+
+    def points(p):
+        p[-1, LEFT] += [0.2, 0, rise]
+
+    def lam(f):
+        f[-1] = carrying(MODEL, BODY[:3], FEET, on=[False, True, True, True])
+
+    checks = verify(MODEL, spoilt(points, lam), terrain=ground)
+    assert failure(checks) is None
+    check = checks["penetration_between"]
+    # Shallower than the top by what the way out sideways is shorter.
+    assert 0.5 * depth < check.value < 2 * depth
+    assert check.kept == (check.value <= 0.02)
+    assert check.point == "front_left"
+    assert REST.t[-2] < check.t < REST.t[-1]
+
+
+def test_contact_sequence():
+    found = contact_sequence(lifted(0.02), FLAT, names=MODEL.names)
+    left, right = found["contacts"][:2]
+    assert left == {
+        "point": "front_left",
+        "intervals": [[0.0, 0.95]],
+        "duty_factor": pytest.approx(0.95),
+    }
+    assert right["intervals"] == [[0.0, 1.0]]
+    assert found["touchdowns"] == []
+    lam = REST.lam.copy()
+    lam[3:6, RIGHT] = 0
+    lam[:9, HIND_LEFT] = 0
+    found = contact_sequence(replace(REST, lam=lam), FLAT, names=MODEL.names)
+    assert found["touchdowns"] == [{"t": 0.3, "point": "front_right"}, {"t": 0.45, "point": "hind_left"}]
+    assert [len(c["intervals"]) for c in found["contacts"]] == [1, 2, 1, 1]

@@ -1,0 +1,119 @@
+"""From a reference to joints: against Pinocchio's forward dynamics, out of reach, and with redundant joints."""
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.spatial.transform import Rotation
+
+from references import standing
+from slomo.motion import Reference
+from slomo.optimize.inverse import joint_motion
+from slomo.pointfoot import PointFootModel
+from slomo.robot import load_robot
+
+ROBOT = load_robot("go1")
+MODEL = PointFootModel.from_robot(ROBOT)
+BODY = np.array([0.0, 0.0, ROBOT.standing_height, 0, 0, 0, 1])
+FEET = ROBOT.nominal_feet * [1, 1, 0]
+WORLD = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+
+
+def seen_from_outside(robot, q, v):
+    """The point-foot state of a whole robot's, laid out as in `motion.Reference`."""
+    model, data = robot.model, robot.model.createData()
+    pin.forwardKinematics(model, data, q, v)
+    pin.updateFramePlacements(model, data)
+    base = model.getFrameId(robot.base)
+    twist = pin.getFrameVelocity(model, data, base, WORLD)
+    feet = [model.getFrameId(n) for n in robot.foot_names]
+    pose = pin.SE3ToXYZQUAT(data.oMf[base])
+    spin = data.oMf[base].rotation.T @ twist.angular
+    return (
+        np.concatenate([pose, *(data.oMf[f].translation for f in feet)]),
+        np.concatenate([twist.linear, spin, *(pin.getFrameVelocity(model, data, f, WORLD).linear for f in feet)]),
+    )
+
+
+def test_torques_that_made_the_motion_are_found_again():
+    """One step of forward dynamics from a state with everything in motion; the inverse returns its torques."""
+    rng = np.random.default_rng(1)
+    model, data, h = ROBOT.model, ROBOT.model.createData(), 0.01
+    q = ROBOT.q_nominal.copy()
+    q[3:7] = Rotation.from_rotvec([0.3, -0.4, 1.0]).as_quat()
+    q[7:] += rng.uniform(-0.2, 0.2, 12)
+    v = rng.normal(0, 1.0, 18)
+    tau, lam = rng.normal(0, 5, 12), rng.normal(0, 20, (4, 3))
+    pin.computeJointJacobians(model, data, q)
+    pin.updateFramePlacements(model, data)
+    feet = [model.getFrameId(n) for n in ROBOT.foot_names]
+    J = np.vstack([pin.getFrameJacobian(model, data, f, WORLD)[:3] for f in feet])
+    a = pin.aba(model, data, q, v, np.concatenate([np.zeros(6), tau]) + J.T @ lam.ravel())
+    before, base = seen_from_outside(ROBOT, q, v), model.getFrameId(ROBOT.base)
+    # The reference's integrator: the new velocities carry positions; the base's linear one lives in the world.
+    v1 = v + h * a
+    after = seen_from_outside(ROBOT, pin.integrate(model, q, h * v1), v1)
+    speed = seen_from_outside(ROBOT, q, v1)[1]
+    pin.forwardKinematics(model, data, q, v, a)
+    speed[:3] = before[1][:3] + h * pin.getFrameClassicalAcceleration(model, data, base, WORLD).linear
+    r = Reference(
+        t=np.array([0, h]), h=np.array([h]), q=np.stack([before[0], after[0]]), v=np.stack([before[1], speed]),
+        u=np.zeros((1, 12)), lam=lam[None], point_names=ROBOT.foot_names, robot_digest="",
+    )  # fmt: skip
+    found = joint_motion(ROBOT, r)
+    assert found.miss.max() < 1e-6
+    assert np.allclose(found.q[0, 7:], q[7:], atol=1e-5)
+    assert np.allclose(found.q[0, :3], q[:3], atol=1e-12)
+    assert np.allclose(found.v[0], v, atol=1e-4)
+    assert np.allclose(found.tau[0], tau, atol=2e-3)
+    assert np.allclose(found.root_wrench[0], 0, atol=2e-3)
+
+
+def test_standing_torques_are_those_of_statics():
+    """The thigh carries its foot's force at its lever; the limb's own weight is the difference to J^T u."""
+    rest = standing(MODEL, BODY, FEET, steps=2)
+    found = joint_motion(ROBOT, rest)
+    assert found.miss.max() < 1e-6
+    assert np.abs(found.v).max() < 1e-4
+    lever = ROBOT.nominal_feet[0, 0] - ROBOT.nominal_hips[0, 0]
+    assert abs(found.tau_static[0, 1]) == pytest.approx(abs(lever) * rest.u[0, 2], rel=1e-3)
+    data = ROBOT.model.createData()
+    J = pin.computeFrameJacobian(ROBOT.model, data, found.q[0], ROBOT.model.getFrameId(ROBOT.foot_names[0]), WORLD)[:3]
+    gravity = pin.computeGeneralizedGravity(ROBOT.model, data, found.q[0])
+    assert np.allclose(found.tau[0, :3], (gravity - J.T @ rest.lam[0, 0])[6:9], atol=1e-6)
+    assert np.allclose(found.root_wrench[:, :3], 0, atol=1e-3)  # all of the weight is on the feet
+
+
+def test_joint_speeds_follow_the_knots():
+    """The body sinks at constant speed between feet that stand still."""
+    rest = standing(MODEL, BODY, FEET, steps=10)
+    q, v = rest.q.copy(), rest.v.copy()
+    q[:, 2] -= 0.1 * rest.t
+    v[:, 2] = -0.1
+    found = joint_motion(ROBOT, replace(rest, q=q, v=v))
+    assert np.allclose(found.q[1:, 7:] - found.q[:-1, 7:], rest.h[:, None] * found.v[1:, 6:])
+    assert np.allclose(found.v[0, 6:], found.v[1, 6:], atol=0.02)
+    for k in (0, 5):
+        assert np.allclose(seen_from_outside(ROBOT, found.q[k], found.v[k])[1][6:], 0, atol=3e-3 if k else 1e-6)
+
+
+def test_out_of_reach_is_missed_by_as_little_as_the_limits_allow():
+    points = FEET.copy()
+    points[0, 2] -= 0.5
+    found = joint_motion(ROBOT, standing(MODEL, BODY, points, steps=1))
+    hip = ROBOT.nominal_hips[0] + BODY[:3]
+    assert found.miss[0, 1:].max() < 1e-6
+    assert found.miss[0, 0] == pytest.approx(np.linalg.norm(points[0] - hip) - ROBOT.leg_reach[0, 1], abs=5e-3)
+    assert np.all((found.q[:, 7:] >= ROBOT.lower) & (found.q[:, 7:] <= ROBOT.upper))
+
+
+def test_a_joint_at_its_limit_is_made_up_for_by_others():
+    """With one hip locked the foot cannot go sideways, but the joints below still do what they can."""
+    points = FEET.copy()
+    points[0] += [0.05, 0.03, 0.0]
+    locked = ROBOT.upper.copy()
+    locked[0] = ROBOT.q_nominal[7] + 1e-3
+    found = joint_motion(replace(ROBOT, upper=locked), standing(MODEL, BODY, points, steps=1))
+    assert 0.02 < found.miss[0, 0] < 0.031
+    assert found.q[0, 7] == pytest.approx(locked[0])
