@@ -13,7 +13,6 @@ from slomo.optimize.dynamics import Body
 from slomo.optimize.iterate import Iterate, Work
 from slomo.optimize.riccati import backward
 from slomo.pointfoot import PointFootModel
-from slomo.robot import load_robot
 
 HIPS = np.array([[0.188, 0.1268, 0], [0.188, -0.1268, 0], [-0.188, 0.1268, 0], [-0.188, -0.1268, 0]])
 
@@ -373,15 +372,6 @@ def test_newton_step_solves_the_linear_quadratic_problem():
     assert np.abs(defects).max() < 1e-10
     deviation = [w.k[k] + w.K[k] @ w.dx[k] - w.du[k] for k in range(N)]
     assert np.abs(deviation).max() < 1e-9 * max(1, np.abs(w.du).max())
-
-
-def test_model_of_go1():
-    model = PointFootModel.from_robot(load_robot("go1"))
-    assert model.total_mass == pytest.approx(13.1, abs=0.1)
-    assert np.allclose(np.abs(model.hips), np.abs(HIPS), atol=2e-3)
-    assert np.all((np.diag(model.inertia) > [0.05, 0.2, 0.25]) & (np.diag(model.inertia) < [0.15, 0.45, 0.5]))
-    assert np.all((model.leg_max > 0.3) & (model.leg_max < 0.385))
-    assert np.all(model.u_max > 50)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import dataclasses
 from functools import cache
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -72,7 +73,12 @@ def test_rollout_is_whole_and_in_step_with_the_reference():
     assert r.joint_names == robot.joint_names
     assert len(r.reference_digest) == 64
     # The reference's world is the plane of the feet's centres.
-    np.testing.assert_allclose(r.q[:, 2] - r.body[:, 2], robot.foot_radius, atol=1e-9)
+    frames = (robot.base, *robot.foot_names)
+    data, ids = robot.model.createData(), [robot.model.getFrameId(name) for name in frames]
+    for k in range(0, T, 100):
+        pin.framesForwardKinematics(robot.model, data, r.q[k])
+        seen = np.array([data.oMf[i].translation for i in ids]) - [0, 0, robot.foot_radius]
+        np.testing.assert_allclose(seen, np.vstack([r.body[k, :3], r.points[k]]), atol=1e-9)
     assert np.all(np.abs(r.points[:, :, 2]) < 0.005)
     np.testing.assert_allclose(
         np.interp(r.t[r.t >= 0], r.t, r.body_ref[:, 1]), 0.03 * np.sin(2 * np.pi * r.t[r.t >= 0]), atol=1e-3

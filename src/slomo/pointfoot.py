@@ -1,6 +1,6 @@
 """The point-foot model: one rigid body and C point masses that touch the ground.
 
-    m  dv_b = sum_c u_c + m g                     body (base frame origin = its centre of mass), world frame
+    m  dv_b = sum_c u_c + m g                     body (base origin = its centre of mass), world frame
     I  dw   = R^T sum_c (f_c - p) x u_c - w x I w   body frame
     m_c df_c'' = -u_c + m_c g + lam_c               each contact point, world frame
 
@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
-import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
 from slomo.errors import InvalidData
 from slomo.robot import Robot, key_point_names
@@ -92,7 +91,7 @@ class PointFootModel:
 
     @property
     def key_points(self) -> tuple[str, ...]:
-        """Names of the points in key-point motions: `<limb>_foot`, or the limb's name where it is a toe, heel or hand."""
+        """Names of the points in key-point motions (see `robot.key_point_names`)."""
         return key_point_names(self.names)
 
     @property
@@ -102,42 +101,22 @@ class PointFootModel:
 
     @classmethod
     def from_robot(cls, robot: Robot, *, mu: float = 0.6) -> Self:
-        """The model of a robot. `mu` is the friction coefficient to plan with.
+        """The model of a robot, all of it from its URDF (see `Robot`). `mu` is the friction coefficient to plan with.
 
-        Body mass is that of the robot without its feet; body inertia that of all links above the last joint of each
-        leg at the nominal pose; leg lengths are the joints' reach, tightened because near a straight or a folded leg
-        the hip frame's own motion counts; `u_max` is what the joint torques allow along one axis at the nominal pose.
-
-        Raises:
-            InvalidData: the robot's [point_foot] lacks `foot_mass`.
+        Leg lengths are the joints' reach, tightened because near a straight or a folded leg the hip frame's own motion
+        counts. `u_max` is what the joint efforts allow along one axis at the nominal pose.
         """
-        if not float(robot.point_foot.get("foot_mass", 0)) > 0:
-            raise InvalidData("[point_foot] needs foot_mass in kg, above 0", where=f"robot {robot.name}")
-        C = len(robot.limbs)
-        foot_mass = np.full(C, float(robot.point_foot["foot_mass"]))
-        model, data = robot.model, robot.model.createData()
-        pin.computeJointJacobians(model, data, robot.q_nominal)
-        pin.updateFramePlacements(model, data)
-        T_world_base = data.oMf[model.getFrameId(robot.base)]
-        feet = [model.getFrameId(name) for name in robot.foot_names]
-        shanks = {model.frames[f].parentJoint for f in feet}
-        body = pin.Inertia.Zero()
-        for j in range(1, model.njoints):
-            if j not in shanks:
-                body += (T_world_base.inverse() * data.oMi[j]).act(model.inertias[j])
-        lever = pin.skew(body.lever)
-        u_max = np.empty((C, 3))
-        for c, f in enumerate(feet):
-            J = pin.getFrameJacobian(model, data, f, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)[:3, 6:]
-            u_max[c] = np.min(robot.effort / np.maximum(np.abs(J), 1e-6), axis=1)
         return cls(
-            mass=robot.mass - float(foot_mass.sum()),
-            inertia=body.inertia - body.mass * lever @ lever,
+            mass=robot.body.mass,
+            inertia=robot.body.inertia,
             hips=robot.nominal_hips,
             leg_min=1.1 * robot.leg_reach[:, 0],
             leg_max=0.97 * robot.leg_reach[:, 1],
-            foot_mass=foot_mass,
-            u_max=u_max,
+            foot_mass=robot.foot_mass,
+            u_max=robot.force_limits,
             names=robot.limb_names,
             mu=mu,
+            pairs=robot.pairs,
+            pair_length=robot.pair_length,
+            clearance=robot.clearance,
         )

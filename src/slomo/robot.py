@@ -1,41 +1,37 @@
 """A robot: its URDF through Pinocchio, and what robots/<name>/robot.toml says of it.
 
 A new robot is a new folder robots/<name>/ with a robot.toml, never a code change. Everything that the kinematics
-can tell (hips, feet, reach, masses) is computed, so that the file only names frames.
+can tell (body, hips, feet, reach, masses, forces) is computed, so that the file only names frames.
 """
 
 import hashlib
-import itertools
-import xml.etree.ElementTree as ET
-from collections.abc import Mapping
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
 from slomo.errors import InvalidData
-from slomo.robot_file import HUMANOID_LIMBS, RobotFile, find_robot_file, find_urdf, read_robot_file, robot_folders
+from slomo.robot_body import point_foot_body, rigid_groups, swing_masses
+from slomo.robot_file import HUMANOID_LIMBS, find_robot_file, find_urdf, read_robot_file, robot_folders
+from slomo.robot_limbs import force_limits, reach, underside
+from slomo.robot_model import (
+    Limb,
+    add_frame,
+    build_model,
+    joint_limit,
+    make_limb,
+    nominal_pose,
+    position_limits,
+    repair_base_inertia,
+)
 
 Array = np.ndarray
 
-
-@dataclass(frozen=True)
-class Limb:
-    """One leg or arm.
-
-    Attributes:
-        hip: frame whose origin at the nominal pose is the limb's attachment to the body.
-        foot: frame at the centre of the contact sphere, of radius `foot_radius` (m).
-    """
-
-    name: str
-    hip: str
-    foot: str
-    foot_radius: float
+BASE_FRAME = "point_foot_body"
+# Part of every robot's digest: raised when the same files come to mean another robot.
+_MEANING = b"2: the base is the centre of mass of the point-foot model's body"
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +42,14 @@ class Robot:
         name, kind: "quadruped" or "humanoid".
         urdf, package_dirs: the model's file and where its package:// addresses are looked up.
         model: Pinocchio model with a free-flyer root (nq = 7 + nj, nv = 6 + nj).
-        base: name of the base frame.
+        base: name of the base frame: at the centre of mass of `body`, oriented as `base_link`. The loader adds it.
+        base_link: the link of the URDF that robot.toml names.
+        body: the point-foot model's body, base frame: mass (kg), no lever, inertia (kg m2).
+        foot_mass: (C,) kg, of the point-foot model's points.
         limbs: C limbs.
         q_nominal: (nq,) standing pose, feet on the ground z = 0, joints in the model's order.
         lower, upper: (nj,) rad.  effort: (nj,) N m.  velocity: (nj,) rad/s.
-        point_foot: what the file adds for the point-foot model.
+        locked: patterns of joints of the URDF that the model lacks, at zero.
         digest: SHA-256 of the file and the URDF.
         notes: what was repaired, for the user's eyes.
     """
@@ -61,14 +60,17 @@ class Robot:
     package_dirs: tuple[Path, ...]
     model: pin.Model
     base: str
+    base_link: str
+    body: pin.Inertia
+    foot_mass: Array
     limbs: tuple[Limb, ...]
     q_nominal: Array
     lower: Array
     upper: Array
     effort: Array
     velocity: Array
-    point_foot: Mapping[str, Any]
     digest: str
+    locked: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
@@ -90,9 +92,14 @@ class Robot:
         return tuple(self.model.names[2:])
 
     @property
+    def feet(self) -> Array:
+        """Columns of the limbs that stand on the ground: all but hands."""
+        return np.flatnonzero([not limb.is_hand for limb in self.limbs])
+
+    @property
     def foot_radius(self) -> float:
-        """m, height of the foot frames over the ground in stance (mean of the limbs')."""
-        return float(np.mean([limb.foot_radius for limb in self.limbs]))
+        """m, height of the foot frames over the ground in stance (mean of the feet's)."""
+        return float(np.mean([limb.foot_radius for limb in self.limbs if not limb.is_hand]))
 
     @property
     def mass(self) -> float:
@@ -111,32 +118,71 @@ class Robot:
 
     @cached_property
     def standing_height(self) -> float:
-        """m, base origin over the foot frames' origins at the nominal pose (add `foot_radius` for the ground)."""
-        return float(-self.nominal_feet[:, 2].mean())
+        """m, base origin over the feet's frames at the nominal pose (add `foot_radius` for the ground)."""
+        return float(-self.nominal_feet[self.feet, 2].mean())
+
+    @cached_property
+    def pairs(self) -> Array:
+        """(P, 2) int, columns of limbs whose points are on one link: toe and heel."""
+        return np.array([g for g in rigid_groups(self.model, self.limbs) if len(g) == 2], int).reshape(-1, 2)
+
+    @cached_property
+    def pair_length(self) -> Array:
+        """(P,) m, distance of the points of each pair."""
+        return np.linalg.norm(np.diff(self.nominal_feet[self.pairs], axis=1)[:, 0], axis=1)
 
     @cached_property
     def leg_reach(self) -> Array:
         """(C, 2) m, least and greatest distance of hip and foot frames within the joint limits.
 
-        The hip frame moves with the joints above it, so this is the length of the leg proper.
+        The hip frame moves with the joints above it, so this is the length of the leg proper. The greatest distances r
+        of toe and heel are such that the point of the sole under the ankle, at most l from the hip, stays within reach
+        whenever both hold: r_i^2 = l^2 + s_i^2 for points at s_i from it, by Stewart's theorem.
         """
-        data = self.model.createData()
         out = np.empty((len(self.limbs), 2))
         for c, limb in enumerate(self.limbs):
-            foot, hip = self.model.getFrameId(limb.foot), self.model.getFrameId(limb.hip)
-            above_hip = self.model.supports[self.model.frames[hip].parentJoint]
-            above_foot = self.model.supports[self.model.frames[foot].parentJoint]
-            joints = [j for j in above_foot if j > 1 and j not in above_hip]
-            grids = [np.linspace(self.lower[j - 2], self.upper[j - 2], 33 if len(joints) <= 2 else 9) for j in joints]
-            lengths = []
-            q = self.q_nominal.copy()
-            for angles in itertools.product(*grids):
-                for j, angle in zip(joints, angles, strict=True):
-                    q[self.model.idx_qs[j]] = angle
-                pin.framesForwardKinematics(self.model, data, q)
-                lengths.append(np.linalg.norm(data.oMf[foot].translation - data.oMf[hip].translation))
-            out[c] = min(lengths), max(lengths)
+            out[c] = self._reach(limb, *self._point(limb))
+        for pair in self.pairs:
+            limb = self.limbs[pair[0]]
+            joint, a = self._point(limb)
+            b = self._point(self.limbs[pair[1]])[1]
+            share = np.clip(-a @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+            sole = a + share * (b - a)  # the joint's origin, which is the ankle, projected on the line from a to b
+            _, length = self._reach(limb, joint, sole)
+            out[pair, 1] = [np.hypot(length, np.linalg.norm(p - sole)) for p in (a, b)]
         return out
+
+    @cached_property
+    def force_limits(self) -> Array:
+        """(C, 3) N, world axes: what the joints allow at each point at the nominal pose, one axis at a time."""
+        data = self.model.createData()
+        pin.computeJointJacobians(self.model, data, self.q_nominal)
+        pin.updateFramePlacements(self.model, data)
+        feet = [self.model.getFrameId(name) for name in self.foot_names]
+        world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        J = np.array([pin.getFrameJacobian(self.model, data, f, world)[:3, 6:] for f in feet])
+        limits = force_limits(J, self.effort)
+        if not np.all(np.isfinite(limits)):
+            c = int(np.argwhere(~np.isfinite(limits))[0, 0])
+            raise InvalidData(f"no joint moves {self.limbs[c].foot!r} along some axis", where=f"robot {self.name}")
+        return limits
+
+    @cached_property
+    def clearance(self) -> Array:
+        """(C,) m, how far a foot's point stays below the base origin along the base's z axis; -inf for hands.
+
+        The trunk's underside is the lowest point of the base link's collision shapes; when it has none, of those of all
+        links that are fixed to it; without any, the height of the hips.
+        """
+        T_base_root = self.model.frames[self.model.getFrameId(self.base)].placement.inverse()
+        fixed = [f for f in self.model.frames if f.type == pin.FrameType.BODY and f.parentJoint == 1]
+        placements = {f.name: T_base_root * f.placement for f in fixed}
+        low = underside(self.urdf, self.package_dirs, {self.base_link: placements[self.base_link]})
+        if not np.isfinite(low):
+            low = underside(self.urdf, self.package_dirs, placements)
+        under = np.full(len(self.limbs), -low) if np.isfinite(low) else -self.nominal_hips[:, 2]
+        under = under + [limb.foot_radius for limb in self.limbs]
+        return np.where([limb.is_hand for limb in self.limbs], -np.inf, under)
 
     @cached_property
     def composite(self) -> pin.Inertia:
@@ -156,6 +202,14 @@ class Robot:
         pin.framesForwardKinematics(self.model, data, q)
         T_world_base = data.oMf[self.model.getFrameId(self.base)]
         return np.array([T_world_base.actInv(data.oMf[self.model.getFrameId(n)].translation) for n in names])
+
+    def _point(self, limb: Limb) -> tuple[int, Array]:
+        """Joint that moves the limb's point, and the point (3,) m in its frame."""
+        frame = self.model.frames[self.model.getFrameId(limb.foot)]
+        return frame.parentJoint, frame.placement.translation
+
+    def _reach(self, limb: Limb, joint: int, point: Array) -> tuple[float, float]:
+        return reach(self.model, self.q_nominal, limb.hip, joint, point, lower=self.lower, upper=self.upper)
 
 
 def key_point_names(limbs: tuple[str, ...]) -> tuple[str, ...]:
@@ -178,120 +232,41 @@ def load_robot(name_or_path: str) -> Robot:
     path = find_robot_file(name_or_path)
     file = read_robot_file(path)
     urdf, package_dirs = find_urdf(file.urdf, path)
-    try:
-        model = pin.buildModelFromUrdf(str(urdf), pin.JointModelFreeFlyer())
-    except ValueError as e:
-        raise InvalidData(f"Pinocchio cannot read it: {e}", where=urdf) from None
-    bodies = [f.name for f in model.frames if f.type == pin.FrameType.BODY]
-    for key, frame in [
-        ("frames.base", file.frames.base),
-        *((f"limbs.{limb.name}.{k}", getattr(limb, k)) for limb in file.limbs for k in ("hip", "foot")),
-    ]:
-        if frame not in bodies:
-            raise InvalidData(f"{key}: no frame {frame!r} in {urdf.name}", where=path, valid=bodies)
-    if model.frames[model.getFrameId(file.frames.base)].parentJoint != 1:
-        raise InvalidData(f"frames.base: {file.frames.base!r} does not move rigidly with the root", where=path)
-    if model.nq != model.njoints - 2 + 7:
-        raise InvalidData("has joints of more than one degree of freedom or without limits", where=urdf)
+    model = build_model(file, urdf, path)
+    lower, upper = position_limits(file, model, path)
+    effort = joint_limit("effort", file.effort, model.effortLimit[6:], model, path)
+    velocity = joint_limit("velocity", file.velocity, model.velocityLimit[6:], model, path)
+    note = repair_base_inertia(model)
+    limbs = tuple(make_limb(section, model, urdf, path) for section in file.limbs)
+    q_nominal = nominal_pose(file, model, limbs, path)
+    for name, angle, lo, hi in zip(model.names[2:], q_nominal[7:], lower, upper, strict=True):
+        if not lo <= angle <= hi:
+            raise InvalidData(f"nominal: {name} is outside its limits", where=path)
 
-    lower, upper = _limits(file, model, path)
-    effort, velocity = np.array(model.effortLimit[6:]), np.array(model.velocityLimit[6:])
-    for what, limit in (("effort", effort), ("velocity", velocity)):
-        if not np.all((limit > 0) & np.isfinite(limit)):
-            raise InvalidData(f"joint {model.names[2 + int(np.argmin(limit))]} has no {what} limit", where=urdf)
-    note = _repair_base_inertia(model)
-    limbs = tuple(Limb(s.name, s.hip, s.foot, s.foot_radius or _foot_radius(urdf, s.foot, path)) for s in file.limbs)
-    robot = Robot(
+    swing = swing_masses(model, q_nominal, limbs)
+    given = [section.foot_mass or file.point_foot.foot_mass for section in file.limbs]
+    foot_mass = np.array([m if m is not None else s for m, s in zip(given, swing, strict=True)])
+    body = point_foot_body(model, q_nominal, limbs, foot_mass, swing)
+    T_root_link = model.frames[model.getFrameId(file.frames.base)].placement
+    T_root_base = pin.SE3(T_root_link.rotation, body.lever)
+    add_frame(model, BASE_FRAME, file.frames.base, T_root_link.inverse() * T_root_base, path)
+    return Robot(
         name=file.name,
         kind=file.kind,
         urdf=urdf,
         package_dirs=package_dirs,
         model=model,
-        base=file.frames.base,
+        base=BASE_FRAME,
+        base_link=file.frames.base,
+        body=T_root_base.inverse().act(body),
+        foot_mass=foot_mass,
         limbs=limbs,
-        q_nominal=_nominal(file, model, limbs, path),
+        q_nominal=q_nominal,
         lower=lower,
         upper=upper,
         effort=effort,
         velocity=velocity,
-        point_foot=file.point_foot,
-        digest=hashlib.sha256(path.read_bytes() + urdf.read_bytes()).hexdigest(),
+        digest=hashlib.sha256(_MEANING + path.read_bytes() + urdf.read_bytes()).hexdigest(),
+        locked=tuple(file.locked),
         notes=(note,) if note else (),
     )
-    outside = [
-        n
-        for n, a, lo, hi in zip(robot.joint_names, robot.q_nominal[7:], lower, upper, strict=True)
-        if not lo <= a <= hi
-    ]
-    if outside:
-        raise InvalidData(f"nominal: {outside[0]} is outside its limits", where=path)
-    return robot
-
-
-def _matching(patterns: Mapping[str, Any], model: pin.Model, where: str, path: Path) -> dict[int, Any]:
-    """Joint index -> value of the one pattern that matches its name."""
-    out: dict[int, Any] = {}
-    names = list(model.names[2:])
-    for pattern, value in patterns.items():
-        hits = [i for i, name in enumerate(names) if fnmatchcase(name, pattern)]
-        if not hits or any(i in out for i in hits):
-            problem = "matches no joint" if not hits else "matches a joint that another entry names"
-            raise InvalidData(f"{where}: {pattern!r} {problem}", where=path, valid=names)
-        out |= dict.fromkeys(hits, value)
-    return out
-
-
-def _limits(file: RobotFile, model: pin.Model, path: Path) -> tuple[Array, Array]:
-    lower, upper = np.array(model.lowerPositionLimit[7:]), np.array(model.upperPositionLimit[7:])
-    for i, (lo, hi) in _matching(file.limits, model, "limits", path).items():
-        lower[i], upper[i] = max(lower[i], lo), min(upper[i], hi)
-    for i in np.flatnonzero(~((lower < upper) & np.isfinite(lower) & np.isfinite(upper))):
-        raise InvalidData(
-            f"limits: joint {model.names[2 + int(i)]} has the range {lower[i]:g}..{upper[i]:g}", where=path
-        )
-    return lower, upper
-
-
-def _nominal(file: RobotFile, model: pin.Model, limbs: tuple[Limb, ...], path: Path) -> Array:
-    """(nq,) the nominal joints, the base frame level and as high as puts the lowest foot on the ground."""
-    q = pin.neutral(model)
-    angles = _matching(file.nominal, model, "nominal", path)
-    missing = [model.names[2 + i] for i in range(model.njoints - 2) if i not in angles]
-    if missing:
-        raise InvalidData(f"nominal: no angle for joint {missing[0]}", where=path)
-    for i, angle in angles.items():
-        q[7 + i] = angle
-    data = model.createData()
-    pin.framesForwardKinematics(model, data, q)
-    T_root_base = data.oMf[model.getFrameId(file.frames.base)]
-    q[:7] = pin.SE3ToXYZQUAT(T_root_base.inverse())
-    pin.framesForwardKinematics(model, data, q)
-    q[2] -= min(data.oMf[model.getFrameId(limb.foot)].translation[2] - limb.foot_radius for limb in limbs)
-    return q
-
-
-def _repair_base_inertia(model: pin.Model) -> str | None:
-    """Make the root body's inertia that of a real body, in place; says what it did.
-
-    A root link without mass makes the free flyer's dynamics singular. It gets at least 1 % of the robot's mass, and
-    principal moments of at least a water sphere's of that mass that satisfy the triangle inequality.
-    """
-    Y = model.inertias[1]
-    mass = max(Y.mass, 0.01 * sum(y.mass for y in model.inertias))
-    moments = np.linalg.eigvalsh(Y.inertia)
-    sphere = 0.4 * mass * (3 * mass / (4 * np.pi * 1000)) ** (2 / 3)
-    if Y.mass >= mass and moments[0] > 0 and moments[0] + moments[1] >= moments[2]:
-        return None
-    add = max(sphere - moments[0], moments[2] - moments[0] - moments[1], 0.0)
-    model.inertias[1] = pin.Inertia(mass, Y.lever, Y.inertia + add * np.eye(3))
-    return f"the base's inertia was singular or missing: now {mass:.3g} kg with {add:.2g} kg m2 added to its moments"
-
-
-def _foot_radius(urdf: Path, link: str, path: Path) -> float:
-    """Radius (m) of the collision sphere of the URDF's foot link."""
-    sphere = ET.parse(urdf).find(f".//link[@name='{link}']/collision/geometry/sphere")
-    if sphere is None:
-        raise InvalidData(
-            f"link {link!r} of {urdf.name} has no collision sphere", where=path, todo="give its limb a foot_radius"
-        )
-    return float(sphere.attrib["radius"])

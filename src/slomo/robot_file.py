@@ -3,7 +3,7 @@
 import importlib.metadata
 import tomllib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -29,16 +29,31 @@ class FramesSection(_Strict):
 
 
 class LimbSection(_Strict):
-    """Frames of one limb; `foot_radius` (m) only where the URDF's foot has no collision sphere."""
+    """One limb: link of its hip, link of its foot, and where in it the contact point is (`offset`, m, link frame).
+
+    `foot_radius` (m) only where the URDF has no collision sphere about that point; with an offset it is 0 then, a point
+    on the sole. `foot_mass` (kg) only to overrule [point_foot].
+    """
 
     name: str
     hip: str
     foot: str
-    foot_radius: float | None = Field(default=None, gt=0)
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    foot_radius: float | None = Field(default=None, ge=0)
+    foot_mass: float | None = Field(default=None, gt=0)
+
+
+class PointFootSection(_Strict):
+    """`foot_mass` (kg) of every limb; without it, what the limb weighs at its end when it swings about its hip."""
+
+    foot_mass: float | None = Field(default=None, gt=0)
 
 
 class RobotFile(_Strict):
-    """The whole file. Keys of `nominal` and `limits` are joint names, `*` matches any part of one."""
+    """The whole file. Keys of joint tables and entries of `locked` are joint names, `*` matches any part of one.
+
+    `locked` joints stay at zero. `limits`, `effort` (N m) and `velocity` (rad/s) tighten what the URDF says.
+    """
 
     name: str
     kind: Literal["quadruped", "humanoid"]
@@ -47,7 +62,10 @@ class RobotFile(_Strict):
     limbs: list[LimbSection] = Field(min_length=1)
     nominal: dict[str, float]
     limits: dict[str, tuple[float, float]] = {}
-    point_foot: dict[str, Any] = {}
+    effort: dict[str, float] = {}
+    velocity: dict[str, float] = {}
+    locked: list[str] = []
+    point_foot: PointFootSection = PointFootSection()
 
 
 def robot_folders() -> dict[str, Path]:
@@ -85,8 +103,9 @@ def read_robot_file(path: Path) -> RobotFile:
     names = tuple(limb.name for limb in parsed.limbs)
     if len(set(names)) != len(names):
         raise InvalidData("limb names repeat", where=path)
-    if parsed.kind == "quadruped" and names != QUADRUPED_LIMBS:
-        raise InvalidData(f"limbs of a quadruped are {names}", where=path, valid=QUADRUPED_LIMBS)
+    valid = QUADRUPED_LIMBS if parsed.kind == "quadruped" else HUMANOID_LIMBS
+    if names != valid:
+        raise InvalidData(f"limbs of a {parsed.kind} are {names}", where=path, valid=valid)
     return parsed
 
 
@@ -109,3 +128,12 @@ def find_urdf(section: UrdfSection, robot_file: Path) -> tuple[Path, tuple[Path,
             if (root / section.path).is_file():
                 return root / section.path, (root.parent,)
     raise InvalidData(f"{section.path!r} is not in the package {section.package!r}", where=robot_file)
+
+
+def find_mesh(address: str, urdf: Path, package_dirs: tuple[Path, ...]) -> Path:
+    """File behind a mesh address of the URDF. Raises `InvalidData` when there is none."""
+    relative = address.removeprefix("package://")
+    for folder in (*package_dirs, urdf.parent):
+        if (folder / relative).is_file():
+            return folder / relative
+    raise InvalidData(f"mesh {address!r} not found", where=urdf, valid=package_dirs)

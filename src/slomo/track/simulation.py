@@ -4,14 +4,13 @@ Pinocchio's conventions outside, MuJoCo's inside: joints in the model's order, q
 frame. Links collide with the ground but not with each other.
 """
 
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import trimesh
 
 from slomo.errors import InvalidData
 from slomo.robot import Robot
+from slomo.robot_file import find_mesh
 from slomo.terrain import Terrain
 
 Array = np.ndarray
@@ -65,7 +64,7 @@ def _prepare(spec: mujoco.MjSpec, robot: Robot, friction: float) -> None:
     root.fullinertia = [Y[0, 0], Y[1, 1], Y[2, 2], Y[0, 1], Y[0, 2], Y[1, 2]]
 
     for mesh in spec.meshes:
-        hull = trimesh.load(_resolve(mesh.file, robot), force="mesh").convex_hull
+        hull = trimesh.load(find_mesh(mesh.file, robot.urdf, robot.package_dirs), force="mesh").convex_hull
         mesh.file, mesh.uservert = "", np.asarray(hull.vertices, float).ravel()
     for limb in robot.limbs:
         foot = spec.body(limb.foot)
@@ -96,15 +95,6 @@ def _add_ground(spec: mujoco.MjSpec, terrain: Terrain, friction: float) -> None:
             size=[(b.x_max - b.x_min) / 2, (b.y_max - b.y_min) / 2, b.height / 2],
             **common,
         )
-
-
-def _resolve(address: str, robot: Robot) -> Path:
-    """File behind a mesh address of the URDF."""
-    relative = address.removeprefix("package://")
-    for folder in (*robot.package_dirs, robot.urdf.parent):
-        if (folder / relative).is_file():
-            return folder / relative
-    raise InvalidData(f"mesh {address!r} not found", where=robot.urdf, valid=robot.package_dirs)
 
 
 class Simulation:
