@@ -3,11 +3,10 @@
 `{"FrameDuration": s, "Frames": [[18 numbers], ...]}`: root xyz, three angles, four end effectors xyz. Units are not
 metric and the conventions differ between files, so what can be told from the data is told from it:
 
-- z up or down: the end effectors hang below the root;
-- animal or person: four end effectors near the ground, or two;
-- the first angle is a heading plus a constant: the constant is the one that best agrees with the direction from the
-  hind to the front feet;
-- left and right: the left feet lie to the left of that direction.
+- which axis is up, animal or person, hands or feet first: see `paper_axes`;
+- the first angle of an animal is a heading plus a constant: the constant is the one that best agrees with the
+  direction from the hind to the front feet;
+- left and right of an animal: the left feet lie to the left of that direction. Of a person's pairs the first is left.
 
 The second and third angle behave like a biased roll and pitch. The root of an animal sits at its pelvis.
 """
@@ -17,14 +16,18 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from slomo.errors import InvalidData
+from slomo.formats.paper_axes import read_axes
 from slomo.motion import KeypointMotion
+
+Array = np.ndarray
 
 _ANGLE_CONFIDENCE = 0.5  # the trunk points are made from angles whose convention is only inferred
 _COLUMNS = 18
-# Median height over the lowest end effector, as a fraction of the root's: feet are below, hands above.
-_FOOT, _HAND = 0.4, 0.55
+_AGREES = 0.7  # mean resultant length of the difference of heading and feet: a spread of about 0.8 rad
+_TURN = 0.5  # s, standard deviation: over a stride, swinging limbs show which way the body looks
 
 
 def load(path: Path, *, note: Callable[[str], None] = lambda message: None) -> KeypointMotion:
@@ -34,33 +37,14 @@ def load(path: Path, *, note: Callable[[str], None] = lambda message: None) -> K
         InvalidData: not such a file, not finite, or its conventions cannot be told from the data.
     """
     frames, dt = _read(path)
-    root, angles, ends = frames[:, :3].copy(), frames[:, 3:6], frames[:, 6:].reshape(-1, 4, 3).copy()
-    below = np.median(root[:, 2]) - np.median(ends[..., 2].min(axis=1))
-    if below < 0:
-        note("z points down in this file: turned by 180 degrees about x")
-        root[:, 1:] *= -1
-        ends[..., 1:] *= -1
-        below = np.median(root[:, 2]) - np.median(ends[..., 2].min(axis=1))
-    if below == 0:
-        raise InvalidData("end effectors are level with the root, so up and down cannot be told", where=path)
+    root, angles, ends = frames[:, :3], frames[:, 3:6], frames[:, 6:].reshape(-1, 4, 3)
+    reading = read_axes(root, ends, dt, where=path, note=note)
+    root, ends = reading.turn(root), reading.turn(ends)
     t = dt * np.arange(len(frames))
-    # Height of each end effector over the lowest one, as a fraction of the root's.
-    level = (np.median(ends[..., 2], axis=0) - np.median(ends[..., 2], axis=0).min()) / below
-    if np.all(level < _FOOT):
-        return _animal(path, t, root, angles, ends, note)
-    if np.all(level[:2] > _HAND) and np.all(level[2:] < _FOOT):
-        hands, feet = ends[:, :2], ends[:, 2:]
-    elif np.all(level[2:] > _HAND) and np.all(level[:2] < _FOOT):
-        hands, feet = ends[:, 2:], ends[:, :2]
-    else:
-        raise InvalidData(
-            f"cannot tell animal from person: end effectors at {np.round(level, 2).tolist()} of the root's height",
-            where=path,
-        )
-    note(f"a person, {'hands' if level[0] > _HAND else 'feet'} first")
-    names = ("pelvis", "left_wrist", "right_wrist", "left_ankle", "right_ankle")
-    positions = np.concatenate([root[:, None], hands, feet], axis=1)
-    return KeypointMotion(t=t, positions=positions, names=names, confidence=np.ones(positions.shape[:2]))
+    if not reading.person:
+        return _animal(path, t, root, angles if reading.axis == 2 else None, ends, note)
+    note(f"a person, {'hands' if reading.hands[0] == 0 else 'feet'} first")
+    return _person(path, t, root, ends[:, list(reading.hands)], ends[:, list(reading.feet)], note)
 
 
 def _read(path: Path) -> tuple[np.ndarray, float]:
@@ -86,28 +70,18 @@ def _read(path: Path) -> tuple[np.ndarray, float]:
 
 
 def _animal(
-    path: Path,
-    t: np.ndarray,
-    root: np.ndarray,
-    angles: np.ndarray,
-    paws: np.ndarray,
-    note: Callable[[str], None],
+    path: Path, t: Array, root: Array, angles: Array | None, paws: Array, note: Callable[[str], None]
 ) -> KeypointMotion:
     along = (paws[:, :2].mean(axis=1) - paws[:, 2:].mean(axis=1))[:, :2]
     length = float(np.median(np.linalg.norm(along, axis=1)))
     if length == 0:
         raise InvalidData("front and hind feet coincide, so the heading cannot be told", where=path)
-    difference = np.arctan2(along[:, 1], along[:, 0]) - angles[:, 0]
-    offset = np.angle(np.median(np.cos(difference)) + 1j * np.median(np.sin(difference)))
-    heading = angles[:, 0] + offset
-    note(f"heading is the first angle {np.degrees(offset):+.0f} degrees, from the direction hind to front feet")
+    direction = np.arctan2(along[:, 1], along[:, 0])
+    heading, pitch, roll = _angles(direction, angles, t, note)
     left = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
     if np.median(np.einsum("tlc,tc->tl", paws[:, ::2, :2] - paws[:, 1::2, :2], left)) < 0:
         note("the first foot of each pair lies to the right: left and right exchanged")
         paws = paws[:, [1, 0, 3, 2]]
-    # The third angle falls when the front end rises (seen on three published clips); the second is -roll.
-    pitch = angles[:, 2] - np.median(angles[:, 2])
-    roll = -(angles[:, 1] - np.median(angles[:, 1]))
     forward = np.stack([np.cos(heading) * np.cos(pitch), np.sin(heading) * np.cos(pitch), -np.sin(pitch)], axis=1)
     level = np.concatenate([left, np.zeros((len(t), 1))], axis=1)
     side = np.cos(roll)[:, None] * level + np.sin(roll)[:, None] * np.cross(forward, level)
@@ -120,3 +94,53 @@ def _animal(
     confidence = np.ones(positions.shape[:2])
     confidence[:, 1:4] = _ANGLE_CONFIDENCE
     return KeypointMotion(t=t, positions=positions, names=names, confidence=confidence)
+
+
+def _angles(
+    direction: Array, angles: Array | None, t: Array, note: Callable[[str], None]
+) -> tuple[Array, Array, Array]:
+    """Heading, pitch and roll (T,) rad from the file's angles, as far as the feet bear them out."""
+    if angles is not None:
+        unit = {s: np.exp(1j * (direction - s * angles[:, 0])) for s in (1.0, -1.0)}
+        sign = max(unit, key=lambda s: abs(unit[s].mean()) + 1e-3 * s)
+        difference = unit[sign]
+        if abs(difference.mean()) > _AGREES:
+            offset = float(np.angle(np.median(difference.real) + 1j * np.median(difference.imag)))
+            start = "" if sign > 0 else "minus "
+            degrees = f"{np.degrees(offset):+.0f} degrees"
+            note(f"heading is {start}the first angle {degrees}, from the direction hind to front feet")
+            # The third angle falls when the front end rises (seen on three published clips); the second is -roll.
+            bend = [angles[:, c] - np.median(angles[:, c]) for c in (2, 1)]
+            return sign * angles[:, 0] + offset, bend[0], -bend[1]
+    note("the angles do not go with the feet: heading from the direction hind to front feet, no roll and pitch")
+    smooth = gaussian_filter1d(np.exp(1j * direction), _TURN / (t[1] - t[0]), mode="nearest")
+    return np.angle(smooth), np.zeros(len(t)), np.zeros(len(t))
+
+
+def _person(
+    path: Path, t: Array, root: Array, hands: Array, feet: Array, note: Callable[[str], None]
+) -> KeypointMotion:
+    """The first of each pair counts as the left one, as in the files of animals, unless that walks backwards."""
+
+    def aside(pair: Array) -> Array:
+        return gaussian_filter1d((pair[:, 0] - pair[:, 1])[:, :2], _TURN / (t[1] - t[0]), axis=0, mode="nearest")
+
+    same = float(np.mean(np.sum(aside(hands) * aside(feet), axis=1) > 0))
+    if 0.4 < same < 0.6:
+        raise InvalidData("cannot tell which hand is on which foot's side: they agree half of the time", where=path)
+    if same < 0.5:
+        note("the first hand is on the side of the second foot: hands exchanged")
+        hands = hands[:, ::-1]
+    left = aside(feet)
+    ahead = np.stack([left[:, 1], -left[:, 0]], axis=1) / np.maximum(np.linalg.norm(left, axis=1), 1e-12)[:, None]
+    path_length = np.gradient(root[:, :2], axis=0)
+    walked = float(np.sum(path_length * ahead))
+    height = float(np.median(root[:, 2] - feet[..., 2].min(axis=1)))
+    if walked < -2 * height and walked < -0.7 * float(np.linalg.norm(path_length, axis=1).sum()):
+        note("the first of each pair counted as left would walk backwards: left and right exchanged")
+        hands, feet = hands[:, ::-1], feet[:, ::-1]
+    else:
+        note("the first of each pair counts as the left one")
+    names = ("pelvis", "left_wrist", "right_wrist", "left_ankle", "right_ankle")
+    positions = np.concatenate([root[:, None], hands, feet], axis=1)
+    return KeypointMotion(t=t, positions=positions, names=names, confidence=np.ones(positions.shape[:2]))
