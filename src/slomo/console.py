@@ -2,7 +2,7 @@
 
 import sys
 import time
-from typing import TextIO
+from typing import Any, TextIO
 
 PLAIN_EVERY = 5.0  # s between two lines where stderr is no terminal
 
@@ -30,6 +30,17 @@ class Console:
         """One line that `quiet` silences."""
         if not self.quiet:
             self.line(text)
+
+    def show(self, picture: Any, text: str) -> None:
+        """Something that rich can draw, on a terminal; elsewhere a line; nothing with `quiet`."""
+        if not self.live:
+            self.note(text)
+        elif self._bars is not None:
+            self._bars.console.print(picture)
+        else:
+            from rich.console import Console as RichConsole
+
+            RichConsole(file=self.stream).print(picture)
 
     def start(self, stage: str) -> None:
         """A stage begins."""

@@ -4,6 +4,7 @@ import contextlib
 import ctypes
 import errno
 import inspect
+import json
 import os
 import signal
 import sys
@@ -145,6 +146,12 @@ class Session:
         if m["stage"] == "report":
             for name in m["files"]:
                 self.console.note(f"report: {path / name}")
+        if m["stage"] == "optimize" and "report.json" in m["files"]:
+            from slomo.report import checks
+
+            report = json.loads((path / "report.json").read_text())
+            if "checks" in report:
+                self.console.show(checks.as_table(report), f"optimize: {checks.as_line(report)}")
         if m["failure"]:
             raise StageFailed(m["failure"], where=m["stage"], todo=f"its best result is in {path}")
 
