@@ -41,8 +41,8 @@ def reach(
         tip = data.oMi[joint].act(point)
         line = tip - data.oMf[frame].translation
         J = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)[:, columns]
-        shift = data.oMi[joint].translation - tip
-        return sign * line @ line, sign * 2 * (line @ J[:3] + np.cross(shift, line) @ J[3:])
+        arm = tip - data.oMi[joint].translation
+        return sign * line @ line, sign * 2 * (line @ J[:3] + np.cross(arm, line) @ J[3:])
 
     if not joints:
         distance = float(np.sqrt(squared(np.zeros(0), 1.0)[0]))
