@@ -7,8 +7,8 @@ put every contact frame on its point, the one nearest to a home,
 
 by Gauss-Newton steps, damped by the error's own size (Sugihara, "Solvability-unconcerned inverse kinematics by the
 Levenberg-Marquardt method", 2011), with joints held at a limit that they would cross. S makes joints that move heavy
-parts dear, so that an arm is used before the trunk. Home is the nominal pose; where joints are redundant, a second
-pass takes the first one, smoothed in time.
+parts dear, so that an arm is used before the trunk. Where joints are redundant, home is a little of the way from the
+last knot's angles to the nominal ones, and in a second pass the first one's, smoothed in time.
 
 Inverse dynamics, of each step: the recursive Newton-Euler algorithm (Featherstone 2008, section 5.3) with the step's
 contact forces at the contact frames and the accelerations of the reference's own integrator, a = (v_next - v) / h. It
@@ -32,7 +32,8 @@ FLAT = 0.02  # m/rad, of a foot's tilt about the line from heel to toe: gives wa
 LARGEST_STEP = 0.5  # rad
 STILL = 1e-6  # rad, step at which the iteration ends
 ITERATIONS = 40
-SMOOTHING = 0.1  # s, of the redundant joints' home
+RETURN = 0.5  # s in which redundant joints come back to their nominal angles
+SMOOTHING = 0.2  # s, of the redundant joints' home in the second pass
 
 
 @dataclass(frozen=True)
@@ -67,10 +68,12 @@ def joint_motion(robot: Robot, reference: Reference) -> JointMotion:
     root = np.array([legs.root(*state) for state in zip(r.q, r.v, strict=True)])  # (T, 7 + 6): pose and twist
     q, v = np.empty((T, model.nq)), np.empty((T, model.nv))
     q[:, :7], v[:, :6] = root[:, :7], root[:, 7:]
-    q[:, 7:], miss = legs.sweep(root[:, :7], r.points, np.tile(robot.q_nominal[7:], (T, 1)))
+    nominal = np.tile(robot.q_nominal[7:], (T, 1))
+    keep = np.exp(-np.concatenate([[np.inf], r.h]) / RETURN)
+    q[:, 7:], miss = legs.sweep(root[:, :7], r.points, nominal, keep)
     if nj > len(legs.error):
         home = gaussian_filter1d(q[:, 7:], SMOOTHING * (T - 1) / (r.t[-1] - r.t[0]), axis=0, mode="nearest")
-        q[:, 7:], miss = legs.sweep(root[:, :7], r.points, home)
+        q[:, 7:], miss = legs.sweep(root[:, :7], r.points, home, np.zeros(T))
     v[1:, 6:] = np.diff(q[:, 7:], axis=0) / r.h[:, None]
     v[0, 6:] = legs.velocities(q[0], v[0, :6], v[1, 6:], r.v[0, 6:])
 
@@ -97,14 +100,12 @@ class _Legs:
         self._R_base_root, self._lever = T_root_base.rotation.T, T_root_base.inverse().translation
         # Two points on one link leave it free to roll about the line through them: a foot, kept flat sideways.
         pin.framesForwardKinematics(self.model, self.data, robot.q_nominal)
-        parent = [self.model.frames[f].parentJoint for f in self.points]
         self._flat = []  # joint, and the axis across the foot in its frame, level in the nominal pose
-        for c, joint in enumerate(parent):
-            if parent.count(joint) == 2 and parent.index(joint) == c:
-                other = self.points[parent.index(joint, c + 1)]
-                along = self.data.oMf[self.points[c]].translation - self.data.oMf[other].translation
-                across = np.cross([0.0, 0.0, 1.0], along)
-                self._flat.append((joint, self.data.oMi[joint].rotation.T @ across / np.linalg.norm(across)))
+        for toe, heel in robot.pairs:
+            joint = self.model.frames[self.points[toe]].parentJoint
+            along = self.data.oMf[self.points[toe]].translation - self.data.oMf[self.points[heel]].translation
+            across = np.cross([0.0, 0.0, 1.0], along)
+            self._flat.append((joint, self.data.oMi[joint].rotation.T @ across / np.linalg.norm(across)))
         inertia = np.diag(pin.crba(self.model, self.data, robot.q_nominal))[6:]
         self._scale = np.maximum(1.0, np.sqrt(inertia / np.median(inertia)))
         self.error = np.zeros(3 * len(self.points) + len(self._flat))
@@ -148,11 +149,16 @@ class _Legs:
             out[3 * len(self.points) + i] = -FLAT * (self.data.oMi[joint].rotation[2] @ axis)
         return out
 
-    def sweep(self, root: Array, points: Array, home: Array) -> tuple[Array, Array]:
-        """`solve` at every knot, each from the one before: joints (T, nj) rad and what they miss (T, C) m."""
+    def sweep(self, root: Array, points: Array, home: Array, keep: Array) -> tuple[Array, Array]:
+        """`solve` at every knot, each from the one before: joints (T, nj) rad and what they miss (T, C) m.
+
+        Args:
+            home: (T, nj) rad.  keep: (T,) share of the last knot's angles in the home of each.
+        """
         joints, miss = np.empty(home.shape), np.empty(points.shape[:2])
+        last = home[0]
         for k in range(len(root)):
-            joints[k] = self.solve(root[k], joints[k - 1] if k else home[0], points[k], home[k])
+            last = joints[k] = self.solve(root[k], last, points[k], keep[k] * last + (1 - keep[k]) * home[k])
             miss[k] = np.linalg.norm(self.error[: points[k].size].reshape(-1, 3), axis=1)
         return joints, miss
 
