@@ -26,6 +26,7 @@ def run(reference, *, noise=0.0, push=0.0, mass=1.0, feedback=True, replan=True,
     mpc.warm_up()
     q, v = reference.q[0].copy(), reference.v[0].copy()
     q1, v1, lam = np.empty_like(q), np.empty_like(v), np.zeros((4, 3))
+    flat, free = np.tile([0.0, 0.0, 1.0, 0.0], (4, 1)), np.zeros(4, bool)
     errors, plan = [], mpc.step(0.0, q, v)
     for i in range(round(1000 * reference.t[-1])):
         t = i / 1000
@@ -40,7 +41,7 @@ def run(reference, *, noise=0.0, push=0.0, mass=1.0, feedback=True, replan=True,
         if i == 600:
             v[1] += push / MODEL.mass
         u = plan.feedback(t, q, v) if feedback else plan.at(t).u
-        dynamics.step(plant, 0.001, 1e-6, np.zeros(4), q, v, u.ravel(), q1, v1, lam)
+        dynamics.step(plant, 0.001, 1e-6, flat, free, q, v, u.ravel(), q1, v1, lam)
         q[:], v[:] = q1, v1
     return np.array(errors), plan
 

@@ -5,7 +5,7 @@ themselves when they are made and raise `InvalidData` naming the array and the f
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from typing import Any, Self
 
 import numpy as np
@@ -117,6 +117,8 @@ class _Arrays:
         out: dict[str, Any] = {}
         for f in fields(cls):  # type: ignore[arg-type]
             if f.name not in z:
+                if f.default_factory is not MISSING:
+                    continue
                 raise InvalidData(f"has no array {f.name!r}", where=cls.__name__, valid=z.keys())
             x = z[f.name]
             out[f.name] = str(x) if f.type in (str, "str") else tuple(map(str, x)) if f.name.endswith("names") else x
@@ -135,6 +137,8 @@ class Reference(_Arrays):
         lam: (T-1, C, 3) N, world: contact force of the ground on each point (normal is z on flat ground).
         point_names: C names, the robot's foot (and hand) frames.
         robot_digest: digest of the robot for which it was made.
+        cycle: (4,) m, m, m, rad where the motion repeats for ever: the end is the start turned about z by the last and
+            then moved by the others; else (0,).
     """
 
     t: Array
@@ -145,10 +149,13 @@ class Reference(_Arrays):
     lam: Array
     point_names: tuple[str, ...]
     robot_digest: str
+    cycle: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self):
         T, C = len(self.t), len(self.point_names)
         _times(self.t)
+        _shape("cycle", self.cycle, (4,) if len(self.cycle) else (0,))
+        _finite("cycle", self.cycle)
         shapes = dict(h=(T - 1,), q=(T, 7 + 3 * C), v=(T, 6 + 3 * C), u=(T - 1, 3 * C), lam=(T - 1, C, 3))
         for name, shape in shapes.items():
             _shape(name, getattr(self, name), shape)
@@ -190,3 +197,35 @@ class Rollout(_Arrays):
     point_names: tuple[str, ...]
     joint_names: tuple[str, ...]
     reference_digest: str = field(default="")
+
+
+@dataclass(frozen=True)
+class WholeBody(_Arrays):
+    """A motion of the whole robot that satisfies the dynamics of its URDF and contact.
+
+    Attributes:
+        t: (T,) s.  h: (T-1,) s, step lengths.
+        q: (T, 7 + nj) Pinocchio configuration (free-flyer quat_xyzw first, joints in rad).
+        v: (T, 6 + nj): root velocity (3) m/s world, angular velocity (3) rad/s in the root frame, joints (nj) rad/s.
+        tau: (T-1, nj) N m.
+        lam: (T-1, C, 3) N, world: contact force of the ground on each point.
+        point_names: C names.  joint_names: nj names.  robot_digest: digest of the robot for which it was made.
+    """
+
+    t: Array
+    h: Array
+    q: Array
+    v: Array
+    tau: Array
+    lam: Array
+    point_names: tuple[str, ...]
+    joint_names: tuple[str, ...]
+    robot_digest: str
+
+    def __post_init__(self):
+        T, C, nj = len(self.t), len(self.point_names), len(self.joint_names)
+        _times(self.t)
+        shapes = dict(h=(T - 1,), q=(T, 7 + nj), v=(T, 6 + nj), tau=(T - 1, nj), lam=(T - 1, C, 3))
+        for name, shape in shapes.items():
+            _shape(name, getattr(self, name), shape)
+            _finite(name, getattr(self, name))

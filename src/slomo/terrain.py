@@ -63,7 +63,7 @@ class HeightField:
             grid = np.zeros(0)
         if grid.ndim != 2 or min(grid.shape) < 2 or not np.all(np.isfinite(grid)) or not self.spacing > 0:
             raise InvalidData("needs spacing > 0 and at least 2 x 2 finite heights", where="terrain field")
-        object.__setattr__(self, "z", tuple(tuple(float(v) for v in row) for row in grid))
+        object.__setattr__(self, "z", tuple(tuple(row) for row in grid.tolist()))
 
     def sample(self, xy: Array) -> tuple[Array, Array, Array]:
         """Height (...), its gradient (..., 2) and whether the field covers the points (..., 2 or more)."""
@@ -71,7 +71,8 @@ class HeightField:
         s = (xy[..., :2] - [self.x_min, self.y_min]) / self.spacing
         inside = np.all((s >= 0) & (s <= np.array(grid.shape) - 1), axis=-1)
         cell = np.clip(np.floor(s).astype(int), 0, np.array(grid.shape) - 2)
-        a, b = np.moveaxis(np.clip(s - cell, 0, 1), -1, 0)
+        part: Array = np.clip(s - cell, 0, 1)
+        a, b = part[..., 0], part[..., 1]
         i, j = cell[..., 0], cell[..., 1]
         z00, z01, z10, z11 = grid[i, j], grid[i, j + 1], grid[i + 1, j], grid[i + 1, j + 1]
         z = (1 - a) * ((1 - b) * z00 + b * z01) + a * ((1 - b) * z10 + b * z11)

@@ -42,8 +42,8 @@ def end_cost(e, multiplier, rho):
 
 @compiled
 def end_penalty(rho, i, nv):
-    """Penalty of entry i of the end gap: velocities count a tenth of positions (s)."""
-    return rho if i < nv else 0.01 * rho
+    """Penalty of entry i of the end gap: velocities count a third of positions."""
+    return rho if i < nv else 0.1 * rho
 
 
 @compiled

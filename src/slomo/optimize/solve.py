@@ -47,7 +47,7 @@ class Settings:
     penalty: float = 1e4
     constraint_tolerance: float = 1e-5
     cone_tolerance: float = 1e-3
-    end_tolerance: float = 1e-7
+    end_tolerance: float = 5e-7
     rounds: int = 16
     strict: bool = False
     starts: int = 4

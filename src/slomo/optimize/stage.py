@@ -3,21 +3,19 @@
 from dataclasses import dataclass, fields
 from typing import Any
 
-import numpy as np
-
 from slomo.errors import UsageError
-from slomo.motion import KeypointMotion, Reference
+from slomo.motion import KeypointMotion
 from slomo.optimize import problem
-from slomo.optimize.check import Check, as_report, failure
+from slomo.optimize.check import as_report, failure
+from slomo.optimize.plan import SOLVERS, Plan, Wish, make_plan
 from slomo.optimize.sequence import contact_sequence
-from slomo.optimize.solve import Settings, Solution, solve
-from slomo.optimize.verify import tracking_table, verify
+from slomo.optimize.solve import Settings
+from slomo.optimize.verify import tracking_table
 from slomo.pointfoot import PointFootModel
 from slomo.stage import Artifact, Inputs, Progress
 from slomo.terrain import Terrain
 
 VERSION = 2
-METHOD = "multiple-shooting DDP, smooth contact"
 
 
 @dataclass(frozen=True)
@@ -30,6 +28,13 @@ class Config(problem.Weights):
         kappa: N m, gap times normal force at the end of the homotopy.
         iterations: most Newton steps for each kappa.
         tolerance: relative decrease of the cost below which a solve has converged.
+        solver: "ddp" (compiled, smooth contact), "fatrop" (the same problem, a check) or "ipopt" (the published form).
+        strict: loaded feet do not slide at all.
+        cyclic: only one cycle of the gait, closed so that it can be repeated for ever.
+        free_scale: the size of the motion is a variable of the problem.
+        shortest_step, longest_step: of a step, as factors of dt; where they differ step lengths are variables.
+        step_weight: of the squared relative deviation of step lengths from dt, per second of motion.
+        starts: most starts that are tried before a solve counts as failed.
     """
 
     dt: float = 0.05
@@ -37,6 +42,14 @@ class Config(problem.Weights):
     kappa: float = 5e-5
     iterations: int = 200
     tolerance: float = 1e-6
+    solver: str = "ddp"
+    strict: bool = False
+    cyclic: bool = False
+    free_scale: bool = False
+    shortest_step: float = 1.0
+    longest_step: float = 1.0
+    step_weight: float = 10.0
+    starts: int = 4
 
 
 def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
@@ -46,63 +59,90 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
 
     Raises:
         UsageError: a parameter outside its range.
-        InvalidData: missing key points, or a motion of less than two steps.
+        InvalidData: missing key points, a motion of less than two steps, or no cycle where one is asked for.
     """
     robot = inputs.robot
     assert robot is not None
-    for name in ("dt", "mu", "kappa", "iterations", "tolerance"):
-        if not getattr(config, name) > 0:
-            raise UsageError(f"needs a number above 0, got {getattr(config, name)}", where=f"optimize.{name}")
-    for f in fields(problem.Weights):
-        if not getattr(config, f.name) >= 0:
-            raise UsageError(f"needs a number of at least 0, got {getattr(config, f.name)}", where=f"optimize.{f.name}")
+    _check(config)
     source = inputs.artifacts["retarget"]
     motion = KeypointMotion.from_arrays(source.npz["keypoints.npz"])
     terrain = Terrain.from_json(source.json["terrain.json"])
     model = PointFootModel.from_robot(robot, mu=config.mu)
     want = problem.targets(motion, model, terrain, dt=config.dt)
-    task = problem.make_task(model, want, terrain, config)
-    start = problem.make_start(model, want, task)
     progress.update(0.02, "loading the compiled solver (the first run compiles it, which takes half a minute)")
-    settings = Settings(
-        kappas=(*(k for k in Settings().kappas if k > config.kappa), config.kappa),
-        iterations=config.iterations,
-        tolerance=config.tolerance,
+    wish = Wish(
+        solver=config.solver,
+        settings=Settings(
+            kappas=(*(k for k in Settings().kappas if k > config.kappa), config.kappa),
+            iterations=config.iterations,
+            tolerance=config.tolerance,
+            strict=config.strict,
+            starts=config.starts,
+        ),
+        weights=config,
+        steps=_steps(config),
+        cyclic=config.cyclic,
+        free_scale=config.free_scale,
     )
-    solution = solve(
-        model, task, start, terrain=terrain, settings=settings, report=lambda f, m: progress.update(0.05 + 0.8 * f, m)
+    plan = make_plan(
+        robot, model, want, terrain=terrain, wish=wish, report=lambda f, m: progress.update(0.05 + 0.85 * f, m)
     )
-    it = solution.iterate
-    reference = Reference(
-        t=want.t, h=np.diff(want.t), q=it.qs, v=it.vs, u=it.us, lam=it.lam,
-        point_names=robot.foot_names, robot_digest=robot.digest,
-    )  # fmt: skip
-    progress.update(0.9, "verifying")
-    checks = verify(model, reference, terrain=terrain, robot=robot, want=want)
-    report = make_report(checks, solution, reference)
-    report["tracking"] = tracking_table(reference, want, model.names)
-    report |= contact_sequence(reference, terrain, names=model.names)
-    wrong = failure(checks)
-    if wrong is not None and solution.status != "converged":
-        wrong += f"; the solver ended with: {solution.status}"
+    report = make_report(plan, config)
+    report["tracking"] = tracking_table(plan.reference, plan.want, model.names)
+    report |= contact_sequence(plan.reference, terrain, names=model.names)
+    wrong = failure(plan.checks)
+    if wrong is not None and not plan.solution.converged:
+        wrong += f"; the solver ended with: {plan.solution.status}"
+    for what in plan.attempts[1:]:
+        progress.note(what)
+    if plan.cycle is not None:
+        progress.note(f"one cycle, {plan.cycle[0]:.2f} to {plan.cycle[1]:.2f} s of the motion")
+    if config.free_scale:
+        progress.note(f"the motion's size became {plan.scale:.3f} of what was retargeted")
     progress.note(
-        f"{METHOD}: {solution.status} after {solution.iterations} steps, {solution.seconds:.1f} s for "
+        f"{report['method']}: {plan.solution.status} after {plan.solution.iterations} steps, {plan.seconds:.1f} s for "
         f"{report['motion_seconds']:.1f} s of motion; {'not verified' if wrong else 'verified'}"
     )
     return Artifact(
-        npz={"reference.npz": reference.to_arrays()},
+        npz={"reference.npz": plan.reference.to_arrays()},
         json={"report.json": report, "terrain.json": terrain.to_json()},
         failure=wrong,
     )
 
 
-def make_report(checks: dict[str, Check], solution: Solution, reference: Reference) -> dict[str, Any]:
+def _check(config: Config) -> None:
+    for name in ("dt", "mu", "kappa", "iterations", "tolerance", "shortest_step", "starts"):
+        if not getattr(config, name) > 0:
+            raise UsageError(f"needs a number above 0, got {getattr(config, name)}", where=f"optimize.{name}")
+    for f in (*fields(problem.Weights), *(f for f in fields(Config) if f.name == "step_weight")):
+        if not getattr(config, f.name) >= 0:
+            raise UsageError(f"needs a number of at least 0, got {getattr(config, f.name)}", where=f"optimize.{f.name}")
+    if not config.shortest_step <= 1 <= config.longest_step:
+        raise UsageError(
+            f"1 does not lie between {config.shortest_step} and {config.longest_step}", where="optimize.shortest_step"
+        )
+    if config.solver not in SOLVERS:
+        raise UsageError(f"no solver {config.solver!r}", where="optimize.solver", valid=tuple(SOLVERS))
+
+
+def _steps(config: Config) -> problem.Steps | None:
+    if config.shortest_step == config.longest_step:
+        return None
+    return problem.Steps(config.shortest_step, config.longest_step, config.step_weight)
+
+
+def make_report(plan: Plan, config: Config) -> dict[str, Any]:
     """The content of `report.json` but for tracking and contacts."""
-    return as_report(checks) | {
-        "solve_seconds": solution.seconds,
-        "compile_seconds": solution.compile_seconds,
-        "motion_seconds": float(reference.t[-1] - reference.t[0]),
-        "method": METHOD,
-        "status": solution.status,
-        "iterations": solution.iterations,
+    return as_report(plan.checks) | {
+        "solve_seconds": plan.seconds,
+        "compile_seconds": plan.solution.compile_seconds,
+        "motion_seconds": float(plan.reference.t[-1] - plan.reference.t[0]),
+        "method": SOLVERS[config.solver][2] + (", no slip" if config.strict else ""),
+        "status": plan.solution.status,
+        "iterations": plan.solution.iterations,
+        "cost": plan.solution.cost,
+        "start": plan.solution.start,
+        "attempts": list(plan.attempts),
+        "scale": plan.scale,
+        "cycle": None if plan.cycle is None else list(plan.cycle),
     }

@@ -1,0 +1,169 @@
+"""From targets to a reference that verifies: the solver asked for, and what is tried when the verifier objects.
+
+What the point-foot model cannot know of the whole robot comes back from the verifier: where joints would be overloaded
+the forces of that limb are limited further, and where feet creep too far they are made to stick. Nothing else is
+changed, each attempt is told, and the last word is the verifier's.
+"""
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slomo.motion import Reference
+from slomo.optimize import problem
+from slomo.optimize.check import Check
+from slomo.optimize.cost import Task
+from slomo.optimize.cycle import close, end_shift, find_cycle
+from slomo.optimize.inverse import joint_motion
+from slomo.optimize.iterate import Iterate
+from slomo.optimize.problem import Steps, Targets, Weights
+from slomo.optimize.scale import best_scale
+from slomo.optimize.solve import Report, Settings, Solution
+from slomo.optimize.verify import verify
+from slomo.pointfoot import PointFootModel
+from slomo.robot import Robot
+from slomo.terrain import Terrain
+
+Array = np.ndarray
+
+# Name -> module, its function, and what report.json calls it.
+SOLVERS = {
+    "ddp": ("slomo.optimize.solve", "solve", "multiple-shooting DDP, smooth contact"),
+    "fatrop": ("slomo.optimize.fatrop", "solve_fatrop", "Fatrop, smooth contact"),
+    "ipopt": ("slomo.optimize.ipopt", "solve_ipopt", "IPOPT, complementarity constraints"),
+}
+ATTEMPTS = 5
+_TIGHTER = 0.9  # of the force that would keep a joint just within its torque limit
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What was asked for beside the targets.
+
+    Attributes:
+        solver: name in `SOLVERS`.  settings: of the solve.  weights: of the cost.
+        steps: limits of the step lengths, or None where they are fixed.
+        cyclic: one cycle that closes.  free_scale: whether the size of the motion is a variable.
+    """
+
+    solver: str
+    settings: Settings
+    weights: Weights
+    steps: Steps | None = None
+    cyclic: bool = False
+    free_scale: bool = False
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A reference and what it came from.
+
+    Attributes:
+        reference, checks: the motion and the verifier's judgement.  want: its targets.
+        solution: of the last attempt.  attempts: what each one was about, and how the solver ended.
+        scale: factor on the targets.  cycle: (first, last) time of the cycle in the motion, s, or None.
+        seconds: of solving, all attempts together.
+    """
+
+    reference: Reference
+    checks: dict[str, Check]
+    want: Targets
+    solution: Solution
+    attempts: tuple[str, ...]
+    scale: float
+    cycle: tuple[float, float] | None
+    seconds: float
+
+
+def make_plan(
+    robot: Robot, model: PointFootModel, want: Targets, *, terrain: Terrain, wish: Wish, report: Report
+) -> Plan:
+    """Solve, verify, and try again where that may help.
+
+    Raises:
+        InvalidData: a cycle was asked for and there is none.
+        StageFailed: numbers that are not finite.
+    """
+    cycle = None
+    if wish.cyclic:
+        first, last = find_cycle(want, terrain)
+        cycle = (float(want.t[first]), float(want.t[last]))
+        want = close(want, first, last)
+    scale, seconds, attempts = 1.0, 0.0, []
+
+    def make_task(want: Targets, steps: Steps | None = None) -> Task:
+        task = problem.make_task(model, want, terrain, wish.weights, steps=steps)
+        return task._replace(cyclic=True, shift=end_shift(want)) if wish.cyclic else task
+
+    run = _solver(wish.solver)
+
+    def solve(task: Task, start: Iterate | None, settings: Settings = wish.settings) -> Solution:
+        nonlocal seconds
+        if start is None:
+            start = problem.make_start(model, want, task)
+        else:
+            settings = replace(settings, kappas=settings.kappas[-2:])
+        solution = run(model, task, start, terrain=terrain, settings=settings, report=report)
+        seconds += solution.seconds
+        return solution
+
+    task = make_task(want)
+    if wish.free_scale:
+        scale, want, task, solution = best_scale(want, terrain, make_task=make_task, solve=solve)
+    else:
+        solution = solve(task, None)
+    if wish.steps is not None:
+        # From the solution with fixed steps: it is a point of this problem, so that freedom cannot make it worse.
+        task, it = make_task(want, wish.steps), solution.iterate
+        solution = solve(task, it._replace(us=np.column_stack([it.us, task.u_ref[:, -1]])))
+    settings, why = wish.settings, "targets"
+    while True:
+        attempts.append(f"{why}: {solution.status}, start {solution.start!r}, {solution.iterations} steps")
+        reference = _reference(robot, model, task, solution)
+        checks = verify(model, reference, terrain=terrain, robot=robot, want=want)
+        wrong = {name for name, c in checks.items() if not c.holds}
+        if wish.solver != "ddp" or len(attempts) >= ATTEMPTS or not wrong:
+            break
+        if "slip_per_second" in wrong and not settings.strict:
+            settings, why = replace(settings, strict=True), "loaded feet made to stick"
+        elif "torque_ratio" in wrong:
+            task, why = _limit_forces(robot, reference, task), "forces limited where joints were overloaded"
+        else:
+            break
+        report(0.0, why)
+        solution = solve(task, solution.iterate, settings)
+    return Plan(reference, checks, want, solution, tuple(attempts), scale, cycle, seconds)
+
+
+def _solver(name: str) -> Callable[..., Solution]:
+    module, function, _ = SOLVERS[name]
+    return getattr(importlib.import_module(module), function)
+
+
+def _reference(robot: Robot, model: PointFootModel, task: Task, solution: Solution) -> Reference:
+    it, nf = solution.iterate, 3 * model.C
+    h = task.h[:-1] if it.us.shape[1] == nf else it.us[:, nf]
+    return Reference(
+        t=np.concatenate([[0.0], np.cumsum(h)]), h=h.copy(), q=it.qs, v=it.vs, u=it.us[:, :nf].copy(), lam=it.lam,
+        point_names=robot.foot_names, robot_digest=robot.digest, cycle=task.shift if task.cyclic else np.zeros(0),
+    )  # fmt: skip
+
+
+def _limit_forces(robot: Robot, reference: Reference, task: Task) -> Task:
+    """The task with the forces of a limb scaled down in the steps where one of its joints is overloaded."""
+    ratio = np.abs(joint_motion(robot, reference).tau) / robot.effort
+    model = robot.model
+    u_low, u_high = task.u_low.copy(), task.u_high.copy()
+    for c, name in enumerate(robot.foot_names):
+        chain = model.supports[model.frames[model.getFrameId(name)].parentJoint]
+        joints = [model.idx_vs[j] - 6 for j in chain if j > 1]
+        over = ratio[:, joints].max(axis=1)
+        columns = slice(3 * c, 3 * c + 3)
+        for k in np.flatnonzero(over > 1.0):
+            # A foot in the air can push no less than its own weight: what is small is left alone.
+            most = np.maximum(np.abs(reference.u[k, columns]) * _TIGHTER / over[k], 0.05 * u_high[k, columns])
+            u_high[k, columns] = np.minimum(u_high[k, columns], most)
+            u_low[k, columns] = np.maximum(u_low[k, columns], -most)
+    return task._replace(u_low=u_low, u_high=u_high)
