@@ -96,10 +96,11 @@ def artifacts(robot, truth):
 
 def test_the_whole_report(artifacts, robot):
     out = stage.run(Inputs(artifacts, {"truth": TRUTH}, robot), stage.Config(fps=5, moments=2), Silent())
-    assert set(out.blobs) == {"side_by_side.mp4", "side_by_side.png", "foot_heights.png"}
+    pictures = ("side_by_side.png", "foot_heights.png", "contacts_and_torques.png")
+    assert set(out.blobs) == {"side_by_side.mp4", *pictures}
     video = out.blobs["side_by_side.mp4"]
     assert 0 < video.find(b"moov") < video.find(b"mdat")  # browsers start at once
-    for name in ("side_by_side.png", "foot_heights.png"):
+    for name in pictures:
         picture = cv2.imdecode(np.frombuffer(out.blobs[name], np.uint8), cv2.IMREAD_COLOR)
         assert picture is not None
         assert picture.std() > 10

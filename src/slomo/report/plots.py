@@ -7,6 +7,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from slomo.motion import KeypointMotion, Reference, Rollout
+from slomo.robot import key_point_names
 from slomo.terrain import Terrain
 
 
@@ -29,8 +30,8 @@ def foot_heights(
     axes = np.atleast_1d(figure.subplots(len(limbs), 1, sharex=True, sharey=True))
     on = rollout.t >= 0
     z_ref, z_robot = (100 * (p[..., 2] - terrain.height(p)) for p in (reference.points, rollout.points[on]))  # cm
-    for c, (axis, limb) in enumerate(zip(axes, limbs, strict=True)):
-        p = target[f"{limb}_foot"]
+    for c, (axis, limb, key_point) in enumerate(zip(axes, limbs, key_point_names(limbs), strict=True)):
+        p = target[key_point]
         z = 100 * (p[:, 2] - terrain.height(p))
         axis.axhline(0, color="0.6", lw=0.8)
         axis.plot(target.t, z, color="#999999", lw=3, label="reconstructed, retargeted")

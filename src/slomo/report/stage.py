@@ -8,17 +8,19 @@ import numpy as np
 from slomo.errors import InvalidData, UsageError
 from slomo.formats.mp4 import encode_mp4
 from slomo.motion import KeypointMotion, Reference, Rollout
+from slomo.optimize.inverse import joint_motion
 from slomo.pointfoot import GRAVITY, PointFootModel
 from slomo.report import table
 from slomo.report.evidence import evidence_picture
 from slomo.report.panels import ClipPanel, KeypointPanel, Panel, ReferencePanel, RobotPanel, heading
 from slomo.report.plots import foot_heights
+from slomo.report.plots_reference import contacts_and_torques
 from slomo.report.video import Composer, FootFalls, contact_sheet, draw_all, png
 from slomo.stage import Arrays, Artifact, Inputs, Progress
 from slomo.synth.score import score
 from slomo.terrain import Terrain
 
-VERSION = 4
+VERSION = 5
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class Config:
 
 
 def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
-    """`side_by_side.mp4`, `side_by_side.png`, `foot_heights.png`, `evidence.png` and `report.json`.
+    """`side_by_side.mp4`, `.png`, `foot_heights.png`, `contacts_and_torques.png`, `evidence.png` and `report.json`.
 
     Takes the artifacts of the whole line; "decode", "evidence" and "reconstruct" are absent when key points were
     imported, and then the video has no panel of a clip. `evidence.png` is left out where nobody said anything about the
@@ -95,10 +97,12 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     progress.update(0.96, "plots")
     target = KeypointMotion.from_arrays(retarget.npz["keypoints.npz"])
     heights = foot_heights(target, reference, rollout, limbs=robot.limb_names, terrain=terrain, robot=robot.name)
+    work = contacts_and_torques(target, reference, joint_motion(robot, reference), robot=robot, terrain=terrain)
     report = _report(inputs, motion, retarget.json["report.json"])
     for line in report["text"].splitlines():
         progress.note(line)
     blobs = {"side_by_side.mp4": video, "side_by_side.png": png(sheet), "foot_heights.png": heights}
+    blobs["contacts_and_torques.png"] = work
     if "evidence" in artifacts:
         frames = artifacts["decode"].npz["frames.npz"]
         seen = evidence_picture(artifacts["evidence"].npz["evidence.npz"], frames["frames"], frames["t"])

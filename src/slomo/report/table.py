@@ -35,12 +35,12 @@ def rows(
     ]
     limits = optimize.get("limits", {})
     units = {"dynamics_residual": "", "complementarity": "N m", "penetration": "m", "slip_per_second": "m/s"}
-    units["torque_ratio"] = ""
+    units |= {"torque_ratio": "", "speed_ratio": "", "joint_miss": "m"}
     for key, unit in units.items():
         out.append(_row("optimize", key.replace("_", " "), optimize.get(key), unit, limits.get(key)))
     out += [
-        _row("optimize", "body error", optimize.get("body_error"), "m"),
-        _row("optimize", "foot error", optimize.get("foot_error"), "m"),
+        _row("optimize", "body error", optimize.get("body_error"), "m", limits.get("body_error")),
+        _row("optimize", "foot error", optimize.get("foot_error"), "m", limits.get("foot_error")),
         _row("optimize", "time to solve", optimize.get("solve_seconds"), "s"),
         _row("optimize", "duration of the motion", optimize.get("motion_seconds"), "s"),
         _row("track", "fell", track.get("fell")),
