@@ -4,7 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from slomo.motion import Reference
+from slomo.optimize.cost import Task
 from slomo.optimize.problem import Targets, velocities
+from slomo.optimize.solve import Solution
 from slomo.pointfoot import PointFootModel
 from slomo.terrain import Terrain
 
@@ -37,6 +40,16 @@ def on(want: Targets, terrain: Terrain) -> Targets:
     q = want.q.copy()
     q[:, 9::3] = np.maximum(q[:, 9::3], terrain.height(want.points))
     return replace(want, q=q, v=velocities(want.t, q))
+
+
+def reference(model: PointFootModel, task: Task, solution: Solution) -> Reference:
+    """What the verifier judges."""
+    it, nf = solution.iterate, 3 * model.C
+    h = it.us[:, nf] if it.us.shape[1] > nf else task.h[:-1]
+    return Reference(
+        t=np.append(0.0, np.cumsum(h)), h=h.copy(), q=it.qs, v=it.vs, u=it.us[:, :nf].copy(), lam=it.lam,
+        point_names=model.names, robot_digest="",
+    )  # fmt: skip
 
 
 def gait(

@@ -5,15 +5,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gaits import gait, humanoid, on, quadruped
+from gaits import gait, humanoid, on, quadruped, reference
 from slomo.errors import UsageError
 from slomo.optimize import problem
 from slomo.optimize.casadi_nlp import OptimalControl
 from slomo.optimize.fatrop import SmoothForm, solve_fatrop
+from slomo.optimize.ipopt import solve_ipopt
 from slomo.optimize.solve import Settings, solve
+from slomo.optimize.verify import verify
 from slomo.terrain import Slope, Terrain
 
 FLAT = Terrain()
+SETTINGS = Settings(kappas=(1e-1, 1e-2, 1e-3, 5e-5))
 
 
 def make(model, duration, *, terrain=FLAT, steps=None, **motion):
@@ -70,16 +73,37 @@ def apart(a, b):
 )
 def test_fatrop_finds_what_the_compiled_solver_finds(model, terrain, motion):
     task, start = make(model, 0.5, terrain=terrain, **motion)
-    ours = solve(model, task, start, terrain=terrain)
-    other = solve_fatrop(model, task, start, terrain=terrain)
+    ours = solve(model, task, start, terrain=terrain, settings=SETTINGS)
+    other = solve_fatrop(model, task, start, terrain=terrain, settings=SETTINGS)
     assert ours.status == other.status == "converged"
     assert other.cost == pytest.approx(ours.cost, rel=1e-2)
     moved, turned = apart(ours.iterate, other.iterate)
     assert moved < 2e-3
     assert turned < 5e-3
     assert other.violation <= 1.001e-5
-    assert np.all(other.iterate.us <= task.u_high + 1e-6)
-    assert np.all(other.iterate.us >= task.u_low - 1e-6)
+    checks = verify(model, reference(model, task, other), terrain=terrain)
+    assert [n for n, c in checks.items() if not c.holds] == []
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.1])
+def test_the_published_form_verifies(slope):
+    """Hard complementarity and Coulomb's pyramid: about the motion that the smooth contact gives."""
+    terrain = Terrain(slopes=(Slope(-9, 9, -9, 9, -9 * slope, slope),))
+    model = quadruped()
+    task, start = make(model, 0.4, terrain=terrain)
+    ours = solve(model, task, start, terrain=terrain, settings=SETTINGS)
+    other = solve_ipopt(model, task, start, terrain=terrain, settings=SETTINGS)
+    assert other.status == "converged"
+    checks = verify(model, reference(model, task, other), terrain=terrain)
+    assert [n for n, c in checks.items() if not c.holds] == []
+    if slope == 0.0:
+        assert other.cost == pytest.approx(ours.cost, rel=1e-2)
+        moved, turned = apart(ours.iterate, other.iterate)
+        assert moved < 1e-3
+        assert turned < 1e-3
+    else:
+        # There is more than one optimum, where feet stand a little elsewhere; both solvers find good ones.
+        assert other.cost == pytest.approx(ours.cost, rel=0.2)
 
 
 def test_the_compiled_solution_is_feasible_for_casadi():
@@ -126,3 +150,12 @@ def test_a_solver_out_of_iterations_says_so_and_keeps_its_iterate():
     assert other.status != "converged"
     assert not other.converged
     assert np.all(np.isfinite(other.iterate.qs))
+
+
+def test_a_solver_out_of_time_says_so_and_keeps_its_iterate():
+    model = quadruped()
+    task, start = make(model, 0.4)
+    other = solve_ipopt(model, task, start, terrain=FLAT, seconds=0.1)
+    assert other.status == "time limit"
+    assert np.all(np.isfinite(other.iterate.qs))
+    assert np.ptp(other.iterate.lam) > 0

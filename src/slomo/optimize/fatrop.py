@@ -22,8 +22,6 @@ from slomo.terrain import Terrain
 
 Array = np.ndarray
 
-METHOD = "Fatrop, smooth contact"
-
 
 def smooth_step(model: PointFootModel, x: ca.SX, u: ca.SX, p: dict[str, ca.SX]) -> tuple[ca.SX, ca.SX]:
     """Next state and contact forces (3, C) of the smooth contact. p: the parts of `casadi_model.fields`."""
@@ -76,7 +74,8 @@ class SmoothForm:
     def unpack(self, task: Task, z: Array, end: Array, kappa: float) -> Iterate:
         qs, vs = cm.from_tangent(task, np.vstack([z[:, : self._nx], end]))
         C = task.ground.shape[1]
-        it = Iterate.at(qs, vs, z[:, self._nx :], C=C, P=len(self.body.pairs))
+        us = np.clip(z[:, self._nx :], task.u_low, task.u_high)
+        it = Iterate.at(qs, vs, us, C=C, P=len(self.body.pairs))
         q1, v1 = np.empty(qs.shape[1]), np.empty(vs.shape[1])
         for k in range(len(z)):
             h = it.us[k, 3 * C] if it.us.shape[1] > 3 * C else task.h[k]
