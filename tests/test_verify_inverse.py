@@ -7,8 +7,9 @@ import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
 
-from references import standing
+from references import carrying, follow, standing
 from slomo.motion import Reference
+from slomo.optimize import problem
 from slomo.optimize.inverse import joint_motion
 from slomo.pointfoot import PointFootModel
 from slomo.robot import load_robot
@@ -117,3 +118,63 @@ def test_a_joint_at_its_limit_is_made_up_for_by_others():
     found = joint_motion(replace(ROBOT, upper=locked), standing(MODEL, BODY, points, steps=1))
     assert 0.02 < found.miss[0, 0] < 0.031
     assert found.q[0, 7] == pytest.approx(locked[0])
+
+
+def reaching(robot):
+    """A humanoid that bends, turns and raises its hands while it lifts a foot: a reference that is only kinematics."""
+    t = np.linspace(0, 3, 61)
+    size = robot.standing_height
+    body = size * np.stack([0.06 * np.sin(3 * t), 0.04 * np.sin(2 * t), 0.06 * np.cos(4 * t) - 0.09], axis=1)
+    body[:, 2] += robot.standing_height
+    turn = Rotation.from_euler("zyx", np.stack([0.3 * np.sin(2 * t), 0.2 * np.sin(3 * t), 0.1 * np.sin(t)], axis=1))
+    points = np.tile(robot.nominal_feet + [0, 0, robot.standing_height], (61, 1, 1))
+    lift = 0.13 * size * np.maximum(0, np.sin(2 * np.pi * t / 1.5))
+    points[:, :2, 2] += lift[:, None]
+    raised = 0.2 * size * (1 - np.cos(2 * t))
+    points[:, 4:, 2] += raised[:, None]
+    points[:, 4, :2] += 0.1 * size * np.stack([np.sin(2 * t), np.sin(3 * t)], axis=1)
+    q = np.concatenate([body, turn.as_quat(), points.reshape(61, -1)], axis=1)
+    lam = np.zeros((60, 6, 3))
+    lam[:, 2:4, 2] = robot.mass * 9.81 / 2
+    zero = np.zeros((60, 18))
+    return Reference(t, np.diff(t), q, problem.velocities(t, q), zero, lam, robot.foot_names, robot.digest)
+
+
+@pytest.mark.parametrize("name", ["g1", "talos"])
+def test_redundant_joints_move_smoothly_and_soles_stay_flat(name):
+    robot = load_robot(name)
+    r = reaching(robot)
+    found = joint_motion(robot, r)
+    assert found.miss.max() < 5e-3
+    assert np.median(found.miss) < 1e-6
+    joints = found.q[:, 7:]
+    assert np.all((joints >= robot.lower) & (joints <= robot.upper))
+    # No jump: no joint turns much faster than feet and body, which move at 1 m/s at most.
+    assert np.abs(found.v[:, 6:]).max() < 6.0
+    for toe, heel in robot.pairs:
+        frame = robot.model.getFrameId(robot.foot_names[toe])
+        sole = rotation(robot, robot.q_nominal, frame).T @ [0, 0, 1]
+        for k in (0, 20, 40):
+            across = np.cross([0, 0, 1], r.points[k, toe] - r.points[k, heel])
+            assert abs(across @ rotation(robot, found.q[k], frame) @ sole) < 0.01 * np.linalg.norm(across)
+
+
+def rotation(robot, q, frame):
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, q)
+    return data.oMf[frame].rotation
+
+
+def test_a_standing_humanoid_needs_no_help_at_its_root():
+    robot = load_robot("g1")
+    model = PointFootModel.from_robot(robot)
+    body = np.array([0.0, 0.0, robot.standing_height, 0, 0, 0, 1])
+    points = robot.nominal_feet + body[:3]
+    on = np.isin(np.arange(6), robot.feet)
+    lam = carrying(model, body[:3], points, on=on)
+    rest = follow(model, np.full(3, 0.05), np.tile(points, (4, 1, 1)), np.tile(lam, (3, 1, 1)), body=body)
+    found = joint_motion(robot, rest)
+    assert found.miss.max() < 1e-9
+    assert np.allclose(found.q[:, 7:], robot.q_nominal[7:], atol=1e-9)
+    assert np.allclose(found.root_wrench, 0, atol=1e-6)
+    assert np.all(np.abs(found.tau) < robot.effort)
