@@ -60,6 +60,8 @@ def build_model(file: RobotFile, urdf: Path, path: Path) -> pin.Model:
     ]:
         if frame not in bodies:
             raise InvalidData(f"{key}: no frame {frame!r} in {urdf.name}", where=path, valid=bodies)
+        if sum(f.name == frame for f in model.frames) > 1:
+            raise InvalidData(f"{key}: {frame!r} names more than one frame of {urdf.name}", where=path, valid=bodies)
     if model.frames[model.getFrameId(file.frames.base)].parentJoint != 1:
         raise InvalidData(f"frames.base: {file.frames.base!r} does not move rigidly with the root", where=path)
     if model.nq != model.njoints - 2 + 7:

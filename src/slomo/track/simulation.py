@@ -4,8 +4,11 @@ Pinocchio's conventions outside, MuJoCo's inside: joints in the model's order, q
 frame. Links collide with the ground but not with each other.
 """
 
+from fnmatch import fnmatchcase
+
 import mujoco
 import numpy as np
+import pinocchio as pin  # pyright: ignore[reportMissingImports]
 import trimesh
 
 from slomo.errors import InvalidData
@@ -21,6 +24,7 @@ ARMATURE = 0.01
 # (s, damping ratio) of the contact: landing at a walk's speed a foot gives in by 4 mm, as rubber does. Under MuJoCo's
 # default of 0.02 s it is 2 cm, the foot's whole radius.
 CONTACT = (0.005, 1.0)
+SOLE = 0.005  # m, radius of the spheres at the points of a sole
 GROUND, ROBOT = 1, 2
 
 
@@ -49,29 +53,36 @@ def build_model(robot: Robot, terrain: Terrain, *, friction: float = 0.8, timest
 def _prepare(spec: mujoco.MjSpec, robot: Robot, friction: float) -> None:
     """Root, inertia, collision shapes and motors."""
     spec.compiler.fusestatic = True
-    root = spec.worldbody.first_body()
-    root.add_freejoint(name="root")
-    # The root with all that is fixed to it is Pinocchio's first body, whose inertia `load_robot` has made regular.
-    inertia = robot.model.inertias[1]
-    pending = [root]
-    while pending:
-        body = pending.pop()
+    spec.worldbody.first_body().add_freejoint(name="root")
+    for joint in list(spec.joints):
+        if any(fnmatchcase(joint.name, pattern) for pattern in robot.locked):
+            spec.delete(joint)
+    # Each body that moves weighs what Pinocchio's does, in which all that is fixed to it, and the repairs of
+    # `load_robot`, are counted already.
+    for body in spec.bodies:
+        if body.name == "world":
+            continue
         body.explicitinertial = True
         body.mass, body.inertia, body.fullinertia = 0.0, [0, 0, 0], [np.nan, 0, 0, 0, 0, 0]
-        pending += [b for b in body.bodies if not b.joints]
-    Y = inertia.inertia
-    root.mass, root.ipos = inertia.mass, inertia.lever
-    root.fullinertia = [Y[0, 0], Y[1, 1], Y[2, 2], Y[0, 1], Y[0, 2], Y[1, 2]]
+        if body.joints:
+            name = body.joints[0].name
+            inertia = robot.model.inertias[1 if name == "root" else robot.model.getJointId(name)]
+            Y = inertia.inertia
+            body.mass, body.ipos = inertia.mass, inertia.lever
+            body.fullinertia = [Y[0, 0], Y[1, 1], Y[2, 2], Y[0, 1], Y[0, 2], Y[1, 2]]
 
     for mesh in spec.meshes:
         hull = trimesh.load(find_mesh(mesh.file, robot.urdf, robot.package_dirs), force="mesh").convex_hull
         mesh.file, mesh.uservert = "", np.asarray(hull.vertices, float).ravel()
-    for limb in robot.limbs:
-        foot = spec.body(limb.foot)
-        for geom in list(foot.geoms):
+    for link in {limb.link for limb in robot.limbs}:
+        for geom in list(spec.body(link).geoms):
             spec.delete(geom)
-        foot.add_geom(name=limb.foot, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[limb.foot_radius, 0, 0])
-        foot.add_site(name=limb.foot)
+    for limb in robot.limbs:
+        foot, radius = spec.body(limb.link), limb.foot_radius or SOLE
+        # The sphere of a point on a sole lies above it.
+        centre = np.array(limb.offset) + (radius - limb.foot_radius) * _up(robot, limb.link)
+        foot.add_geom(name=limb.foot, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], pos=centre)
+        foot.add_site(name=limb.foot, pos=limb.offset)
     for geom in spec.geoms:
         geom.density = 0  # the links' masses are the URDF's; MuJoCo would add the shapes'
         geom.contype, geom.conaffinity = ROBOT, GROUND
@@ -82,6 +93,13 @@ def _prepare(spec: mujoco.MjSpec, robot: Robot, friction: float) -> None:
         joint.armature = ARMATURE
         motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         motor.ctrllimited, motor.ctrlrange = True, [-effort, effort]
+
+
+def _up(robot: Robot, link: str) -> Array:
+    """(3,) the world's z axis in a link's frame at the nominal pose."""
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, robot.q_nominal)
+    return data.oMf[robot.model.getFrameId(link)].rotation[2]
 
 
 def _add_ground(spec: mujoco.MjSpec, terrain: Terrain, friction: float) -> None:
