@@ -4,13 +4,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from references import carrying, follow, standing
 from slomo.motion import Reference
 from slomo.optimize.check import as_report, failure
 from slomo.optimize.inverse import joint_motion
 from slomo.optimize.sequence import contact_sequence
-from slomo.optimize.verify import tracking_table, verify
+from slomo.optimize.verify import cycle_gap, tracking_table, verify
 from slomo.pointfoot import PointFootModel
 from slomo.robot import load_robot
 from slomo.terrain import Box, HeightField, Slope, Terrain
@@ -104,6 +105,15 @@ def _pull(f):
     f[-1, LEFT, 2] = -0.5
 
 
+def cyclic(points=None) -> Reference:
+    """Standing as a cycle that goes nowhere; the end is turned by nothing."""
+    return replace(spoilt(points), cycle=np.zeros(4))
+
+
+def _elsewhere(p):
+    p[-1, LEFT, 1] += 1e-4
+
+
 CASES = {
     "an input": Case("dynamics_residual", edited("u", (4, 2), 0.01), 5, "front_left"),
     "a contact force": Case("dynamics_residual", edited("lam", (4, 1, 0), 0.01), 5, "front_right"),
@@ -130,6 +140,7 @@ CASES = {
     "a foot at the belly": Case(
         "body_clearance", lifted(0.003), -1, "front_left", model=replace(MODEL, clearance=np.full(4, BODY[2] - 1e-3))
     ),
+    "a cycle that does not close": Case("cycle_gap", cyclic(_elsewhere), -1, "front_left"),
     "a weak motor": Case(
         "torque_ratio", spoilt(lam=_stamp), -2, "FL_calf_joint", robot=replace(ROBOT, effort=weak_knees())
     ),
@@ -161,8 +172,21 @@ def test_one_flaw_fails_one_check(case):
 
 def test_every_required_check_has_a_flaw():
     model = replace(MODEL, pairs=[[0, 1]], pair_length=[FEET[0, 1] - FEET[1, 1]], clearance=np.zeros(4))
-    checks = verify(model, REST, terrain=FLAT, robot=ROBOT, want=Wanted())
+    checks = verify(model, cyclic(), terrain=FLAT, robot=ROBOT, want=Wanted())
     assert {n for n, c in checks.items() if c.required} == {case.check for case in CASES.values()}
+
+
+def test_a_cycle_turns_and_moves():
+    """Standing again elsewhere, turned by 0.7 rad: the same state, seen from there."""
+    turn, move = Rotation.from_euler("z", 0.7), np.array([0.3, -0.2, 0.0])
+    q, v = REST.q.copy(), REST.v.copy()
+    v[0, :6] = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+    q[-1, :3], q[-1, 3:7] = turn.apply(q[0, :3]) + move, (turn * Rotation.from_quat(q[0, 3:7])).as_quat()
+    q[-1, 7:] = (turn.apply(REST.points[0]) + move).ravel()
+    v[-1, :3], v[-1, 3:6] = turn.apply(v[0, :3]), v[0, 3:6]
+    r = replace(REST, q=q, v=v, cycle=np.append(move, 0.7))
+    assert cycle_gap(r).max() < 1e-12
+    assert cycle_gap(replace(r, cycle=np.append(move, 0.71))).max() == pytest.approx(0.01, rel=0.1)
 
 
 def test_standing_is_verified():

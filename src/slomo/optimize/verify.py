@@ -56,7 +56,8 @@ def verify(
     dynamics_residual: defect of one semi-implicit step, in m, rad, m/s and rad/s alike, and s of the time axis.
     Those of `ground_checks`.
     input_ratio: |u| / u_max.  leg_length: m beyond the limits.  pair_distance: m, toe to heel, off their distance.
-    body_clearance: m by which a point comes too near to the body.
+    body_clearance: m by which a point comes too near to the body.  cycle_gap: m, rad, m/s and rad/s by which a motion
+    that is to repeat for ever does not close.
     With a robot, those of `joint_checks`.  With what was wanted, `body_error` and `foot_error` (warnings): m, mean.
     """
     r, names = reference, model.names
@@ -76,6 +77,9 @@ def verify(
     if np.any(np.isfinite(model.clearance)):
         below = -np.einsum("tji,tcj->tci", R.as_matrix(), r.points - r.q[:, None, :3])[..., 2]
         checks["body_clearance"] = worst(np.maximum(model.clearance - below, 0.0), 1e-3, "m", r.t, names)
+    if len(r.cycle):
+        parts = ("body position", "body rotation", "body velocity", *names)
+        checks["cycle_gap"] = worst(cycle_gap(r), 1e-6, "", r.t[-1:], parts)
     if robot is not None:
         checks |= joint_checks(robot, r, joint_motion(robot, r))
     if want is not None:
@@ -107,6 +111,20 @@ def dynamics_defect(model: PointFootModel, r: Reference) -> Array:
             np.abs(np.diff(r.t) - r.h),
         ]
     )
+
+
+def cycle_gap(r: Reference) -> Array:
+    """(1, 3 + C) how far the last state is from the first one, turned about z and moved by `Reference.cycle`: body
+    position, rotation and velocities, and each point with its velocity."""
+    turn = Rotation.from_euler("z", r.cycle[3])
+    place = turn.apply(np.vstack([r.q[0, :3], r.points[0]])) + r.cycle[:3]
+    speed = turn.apply(np.vstack([r.v[0, :3], r.v[0, 6:].reshape(-1, 3)]))
+    off = np.abs(np.vstack([r.q[-1, :3], r.points[-1]]) - place).max(axis=1)
+    off_speed = np.abs(np.vstack([r.v[-1, :3], r.v[-1, 6:].reshape(-1, 3)]) - speed).max(axis=1)
+    rotation = (turn * Rotation.from_quat(r.q[0, 3:7])).inv() * Rotation.from_quat(r.q[-1, 3:7])
+    spin = np.abs(r.v[-1, 3:6] - r.v[0, 3:6]).max()
+    body = [off[0], rotation.magnitude(), max(off_speed[0], spin)]
+    return np.concatenate([body, np.maximum(off, off_speed)[1:]])[None]
 
 
 def joint_checks(robot: Robot, reference: Reference, motion: JointMotion) -> dict[str, Check]:
