@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from slomo.errors import InvalidData, UsageError
 from slomo.motion import KeypointMotion
@@ -31,7 +32,8 @@ def retarget(motion: KeypointMotion, config: Config | None = None) -> tuple[Keyp
 def test_scale_height_and_distance_are_the_robots():
     motion, out = retarget(walk(leg=0.5))
     scale = out.json["report.json"]["scale"]
-    assert scale == pytest.approx(GO1.standing_height / 0.5, rel=0.03)
+    leg = float((GO1.nominal_hips - GO1.nominal_feet)[:, 2].mean())
+    assert scale == pytest.approx(leg / 0.5, rel=0.03)
     assert np.median(motion["base"][:, 2]) == pytest.approx(GO1.standing_height, rel=0.02)
     assert motion["base"][-1, 0] == pytest.approx(scale * 0.6 * motion.t[-1], rel=0.05)
     np.testing.assert_allclose(motion["base"][0, :2], 0, atol=1e-9)
@@ -111,6 +113,134 @@ def test_step_lies_between_front_and_hind_feet():
     np.testing.assert_allclose(np.median(hips), 0.1, atol=0.01)
     with pytest.raises(InvalidData, match="does not fit"):
         retarget(walk(), Config(step_height=0.1))
+
+
+def test_step_goes_down_too_and_parts_left_from_right():
+    standing = walk(speed=0.0)
+    motion, out = retarget(standing, Config(step_height=-0.08))
+    assert motion["hind_left_foot"][:, 2].min() == pytest.approx(0.08)
+    assert motion["front_left_foot"][:, 2].min() == pytest.approx(0.0)
+    motion, out = retarget(standing, Config(step_height=0.05, step_limbs=("front_right", "hind_right")))
+    (box,) = out.json["terrain.json"]["boxes"]
+    assert motion["front_right_foot"][:, 1].max() < box["y_max"] < motion["front_left_foot"][:, 1].min()
+
+
+def tilts(motion: KeypointMotion) -> Rotation:
+    """World from body, from base and hips."""
+    arms = motion.positions[:, 1:5] - motion.positions[:, :1]
+    return Rotation.concatenate([Rotation.align_vectors(a, GO1.nominal_hips)[0] for a in arms])
+
+
+@pytest.mark.parametrize("seconds_up", [1.5, 6.0])
+def test_rearing_by_sixty_degrees_is_kept(seconds_up):
+    seconds, angle = 6.0, np.radians(60)
+    motion = walk(speed=0.0, seconds=seconds)
+    up = angle * np.clip((seconds_up / 2 + 0.3 - np.abs(motion.t - seconds / 2)) / 0.5, 0, 1)
+    got, out = retarget(raised(motion, up))
+    said = np.degrees(np.arcsin(tilts(got).as_matrix()[:, 2, 0]))
+    assert said.max() == pytest.approx(60, abs=6)
+    report = out.json["report.json"]
+    assert report["held_up"] == ([] if seconds_up < 6 else ["front_left", "front_right"])
+    middle = np.abs(got.t - seconds / 2) < 0.3
+    assert got.contact is not None
+    assert np.all(got.contact[middle, :2] == 0)
+    assert got.contact[middle, 2:].mean() > 0.5  # it treads on the spot
+    assert got["front_left_foot"][middle, 2].min() > 0.1
+    assert report["beyond_reach_fraction"] == 0
+
+
+def raised(motion: KeypointMotion, angle: np.ndarray) -> KeypointMotion:
+    """Turned up about the hind hips by angle (T,) rad, front legs and all."""
+    out = motion.positions.copy()
+    pivot = (motion["hind_left_hip"] + motion["hind_right_hip"]) / 2
+    for i, name in enumerate(motion.names):
+        if name.startswith("front"):
+            d = out[:, i] - pivot
+            out[:, i, 0] = pivot[:, 0] + np.cos(angle) * d[:, 0] - np.sin(angle) * d[:, 2]
+            out[:, i, 2] = pivot[:, 2] + np.sin(angle) * d[:, 0] + np.cos(angle) * d[:, 2]
+    return replace(motion, positions=out)
+
+
+def test_turning_on_a_circle_is_kept():
+    source = walk(seconds=6.0)
+    angle = 0.5 * source.positions[..., 0] / 0.6  # 0.5 rad/s at 0.6 m/s
+    radius = 1.2 - source.positions[..., 1]
+    circle = np.stack([radius * np.sin(angle), 1.2 - radius * np.cos(angle), source.positions[..., 2]], axis=2)
+    _, out = retarget(replace(source, positions=circle))
+    assert out.json["report.json"]["heading_change_rad"] == pytest.approx(0.5 * source.t[-1], abs=0.1)
+
+
+def test_long_legs_take_shorter_steps_and_it_is_said():
+    long_strides = walk(leg=0.5, speed=2.2, period=0.9)
+    motion, out = retarget(long_strides)
+    report = out.json["report.json"]
+    assert report["stride_scale"] < 0.7
+    assert report["distance_m"] == pytest.approx(report["stride_scale"] * report["scale"] * 2.2 * motion.t[-1], rel=0.1)
+    assert any("strides shortened" in line for line in notes(long_strides))
+
+
+def notes(motion: KeypointMotion, config: Config | None = None) -> list[str]:
+    said: list[str] = []
+    progress = Silent()
+    progress.note = said.append  # type: ignore[method-assign]
+    source = Artifact(npz={"keypoints.npz": motion.to_arrays()})
+    run(Inputs(artifacts={"import": source}, robot=GO1), config or Config(), progress)
+    return said
+
+
+@pytest.mark.parametrize("rate", [10.0, 240.0])
+def test_frame_rate_changes_little(rate):
+    source = walk()
+    t = np.arange(0, source.t[-1], 1 / rate)
+    positions = np.stack(
+        [np.stack([np.interp(t, source.t, x) for x in p.T], axis=1) for p in source.positions.swapaxes(0, 1)], axis=1
+    )
+    got, _ = retarget(replace(source, t=t, positions=positions, confidence=np.ones(positions.shape[:2])))
+    expected, _ = retarget(source)
+    n = min(len(got.t), len(expected.t))
+    assert np.linalg.norm(got.positions[:n] - expected.positions[:n], axis=2).mean() < 0.015
+
+
+def test_repeated_frames_and_a_late_start_change_little():
+    source = walk()
+    frames = np.arange(len(source.t))
+    frames[5::7] -= 1
+    got, _ = retarget(replace(source, t=source.t + 40.0, positions=source.positions[frames]))
+    expected, _ = retarget(source)
+    assert np.linalg.norm(got.positions - expected.positions, axis=2).mean() < 0.01
+
+
+def test_what_stands_in_a_gap_does_not_matter():
+    source = walk()
+    confidence = source.confidence.copy()
+    confidence[20:45, 3] = confidence[70:, 5] = 0
+    out = []
+    for value in (0.0, 1e6):
+        positions = source.positions.copy()
+        positions[confidence == 0] = value
+        out.append(retarget(replace(source, positions=positions, confidence=confidence))[0].positions)
+    np.testing.assert_array_equal(*out)
+    assert any("longest of 0.83 s in front_left_paw" in line for line in notes(replace(source, confidence=confidence)))
+
+
+def test_tilted_and_sinking_ground_is_leveled():
+    source = walk(seconds=6.0)
+    tilt = 0.08
+    R = np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
+    got, out = retarget(replace(source, positions=source.positions @ R.T))
+    expected, _ = retarget(source)
+    assert np.linalg.norm(got.positions - expected.positions, axis=2).max() < 0.04
+    assert out.json["report.json"]["leveled_rad"][1] == pytest.approx(tilt, abs=0.01)
+
+
+def test_one_unseen_shoulder_is_placed_beside_the_other():
+    source = walk()
+    confidence = source.confidence.copy()
+    confidence[:, source.index("front_left_shoulder")] = 0
+    broken = replace(source, confidence=confidence)
+    got, expected = retarget(broken)[0], retarget(source)[0]
+    np.testing.assert_allclose(got.positions, expected.positions, atol=0.01)
+    assert any("front_left_shoulder was never seen" in line for line in notes(broken))
 
 
 def test_wrong_input_is_named():

@@ -69,14 +69,19 @@ def person(
     Args:
         bend: rad, how far the trunk leans forward, one number or one for each of the 30 frames a second.
         jump: m, height of jumps in place, one every `period` s, in the air for sqrt(8 jump / g) s.
-        spread: rad, how far legs and arms open and close, once every `period` s.
+        spread: rad, how far the legs open in jumping jacks, with the arms, once every `period` s.
     """
     t = np.arange(0, seconds, 1 / 30)
     h, zero = height, np.zeros_like(t)
     air = np.sqrt(8 * jump / 9.81)
     since = t % period
     hop = np.where(since < air, 9.81 / 2 * since * (air - since), 0.0)
-    opening = spread * (0.5 - 0.5 * np.cos(2 * np.pi * t / period))
+    # Jumping jacks: 0.3 s in the air to open, and half a period later to close.
+    opening = np.clip(since / 0.3, 0, 1) - np.clip((since - period / 2) / 0.3, 0, 1)
+    opening = spread * opening**2 * (3 - 2 * opening)
+    if spread:
+        half = since % (period / 2)
+        hop = np.where(half < 0.3, 9.81 / 2 * half * (0.3 - half), 0.0)
     leg = 0.470 * h  # hip to ankle; the knees stay a little bent
     pelvis = np.stack([speed * t, zero, 0.045 * h + 0.97 * leg * np.cos(opening / 2) + hop], axis=1)
     bend = bend + zero

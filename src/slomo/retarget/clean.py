@@ -34,12 +34,13 @@ def resample(motion: KeypointMotion, rate: float) -> KeypointMotion:
     )
 
 
-def smooth(x: np.ndarray, weight: np.ndarray, *, dt: float, cutoff: float) -> np.ndarray:
+def smooth(x: np.ndarray, weight: np.ndarray, *, dt: float, cutoff: float, least: float = 0.0) -> np.ndarray:
     """Weighted, robust Whittaker smoother: argmin sum w (y - x)^2 + lambda |second difference of y|^2.
 
     Args:
         x: (T, D).  weight: (T,) >= 0; a zero is a gap that the penalty bridges.
         dt: s.  cutoff: Hz, where a sine loses half its amplitude.
+        least: residuals that count as noise in any case: else a jump would be the outlier of a long stand.
 
     Returns:
         (T, D). Huber weights, re-estimated three times, take spikes out.
@@ -61,7 +62,7 @@ def smooth(x: np.ndarray, weight: np.ndarray, *, dt: float, cutoff: float) -> np
         a[2] += w + 1e-9
         y = solveh_banded(a, w[:, None] * x)
         r = np.linalg.norm(y - x, axis=1)
-        sigma = 1.4826 * np.median(r[weight > 0])
+        sigma = max(1.4826 * float(np.median(r[weight > 0.5 * weight.max()])), least)
         w = weight * np.minimum(1.0, _HUBER * sigma / np.maximum(r, 1e-12)) ** 2
     return y
 
@@ -111,10 +112,19 @@ def thin(motion: KeypointMotion, rate: float) -> KeypointMotion:
 
 
 def despike(motion: KeypointMotion, *, size: float, window: float) -> KeypointMotion:
-    """Confidence 0 for samples further than `size` from the running median over `window` s."""
+    """Confidence 0 for samples further than `size` from the running median over `window` s of the seen samples.
+
+    Samples next to a gap are judged by those beyond it: a bridge would repeat a spike at its end until it looks usual.
+    """
     n = max(3, round(window / float(np.median(np.diff(motion.t)))) | 1)
-    away = np.linalg.norm(motion.positions - median_filter(motion.positions, (n, 1, 1), mode="nearest"), axis=2)
-    return replace(motion, confidence=np.where(away > size, 0.0, motion.confidence))
+    confidence = motion.confidence.copy()
+    for i, c in enumerate(motion.confidence.T):
+        known = np.flatnonzero(c > 0)
+        if len(known):
+            x = motion.positions[known, i]
+            away = np.linalg.norm(x - median_filter(x, (n, 1), mode="nearest"), axis=1)
+            confidence[known[away > size], i] = 0.0
+    return replace(motion, confidence=confidence)
 
 
 def runs(on: np.ndarray) -> list[tuple[int, int]]:

@@ -41,31 +41,31 @@ def lifts(
     Each foot has a floor of its own (its 15th percentile: key points sit at different heights in different paws),
     unless that is so high over the others' that the foot is held up throughout. With one camera the ground also drifts
     and tilts over the clip: some foot of each pair stands within any `window`, so the lower envelope of a pair is the
-    ground there, unless it is higher than drift can be (both front feet of a creature that rears).
+    ground there, unless that is higher over the other pair's than drift can be (front feet of a creature that rears).
 
     Args:
         height: (T, F) m.  known: (F,) bool, feet that were seen.  pairs: columns that stand in turn.
         dt: s.  window: s, longer than any flight phase.
-        leg: m, height of the body over the feet.  most: of `leg`, greatest drift.
+        leg: m, height of the body over the feet.  most: of `leg`, greatest drift of one pair alone.
     """
     floor = np.percentile(height, 15, axis=0)
     held = _held(floor, known, pairs, leg=leg)
     floor = np.where(held, floor[known & ~held].min(), floor)
     over = height - floor
     n = max(1, round(window / dt)) | 1
-    ground = np.zeros_like(over)
-    grounds = []
+    stands = {pair: [f for f in pair if known[f] and not held[f]] for pair in pairs}
+    low = {p: minimum_filter1d(over[:, on].min(axis=1), n, mode="nearest") for p, on in stands.items() if on}
+    # However high, the lowest of all feet is on the ground; a pair is so only as far as that can be drift.
+    lowest = np.min(list(low.values()), axis=0)
+    ground = np.empty_like(over)
     for pair in pairs:
-        stands = [f for f in pair if known[f] and not held[f]]
-        if stands:
-            low = minimum_filter1d(over[:, stands].min(axis=1), n, mode="nearest")
-            low = gaussian_filter1d(np.where(np.abs(low) > most * leg, 0.0, low), window / dt / 2, mode="nearest")
-            ground[:, list(pair)] = low[:, None]
-            grounds.append(low)
+        more = low.get(pair, lowest) - lowest
+        more = gaussian_filter1d(lowest + np.where(more > most * leg, 0.0, more), window / dt / 2, mode="nearest")
+        ground[:, list(pair)] = more[:, None]
     over = over - ground
     rest = np.where(held, 0.0, np.percentile(over, 15, axis=0))
     level = float(np.median((floor + rest)[known & ~held]))
-    return Lifts(np.maximum(over - rest, 0), np.mean(grounds, axis=0) + level, held)
+    return Lifts(np.maximum(over - rest, 0), ground.mean(axis=1) + level, held)
 
 
 def _held(floor: np.ndarray, known: np.ndarray, pairs: tuple[tuple[int, ...], ...], *, leg: float) -> np.ndarray:

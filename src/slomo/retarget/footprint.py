@@ -60,13 +60,14 @@ def footprint(xy: Array, base: Array, trunk: Trunk, standing: Array, body: Robot
     return Footprint(stride * xy + np.einsum("tij,fj->tfi", R, shift), stride * base, stride)
 
 
-def start_at_origin(paths: Footprint, trunk: Trunk) -> tuple[Footprint, Trunk]:
-    """The robot starts at the origin and looks along x."""
+def start_at_origin(paths: Footprint, trunk: Trunk, body: RobotBody) -> tuple[Footprint, Trunk]:
+    """The robot's base starts at the origin and looks along x."""
     turn = -trunk.heading[0]
-    R = rot_z(turn)[:2, :2]
-    start = paths.body[0]
     moved = Trunk(origin=trunk.origin, rotation=Rotation.from_euler("z", turn) * trunk.rotation)
-    return Footprint((paths.soles - start) @ R.T, (paths.body - start) @ R.T, paths.stride), moved
+    R = rot_z(turn)[:2, :2]
+    soles, middle = paths.soles @ R.T, paths.body @ R.T
+    start = middle[0] - moved.rotation[0].apply(body.root)[:2]
+    return Footprint(soles - start, middle - start, paths.stride), moved
 
 
 def on_step(body: RobotBody, limbs: tuple[str, ...], names: tuple[str, ...]) -> Array:

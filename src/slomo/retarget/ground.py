@@ -23,6 +23,7 @@ _CREEP = 0.25  # of the leg: a standing foot that creeps further takes a step
 _STEP = 0.24  # s, duration of such a step
 _FLIGHT = 0.6  # s, longer than any flight phase
 _LEVEL = 0.5  # rad, a body tilted less stands as usual
+_DRIFT = 0.3  # of the leg: ground that rises and sinks more is worth a word
 _AIRBORNE = 0.05  # of the frames: so much time with no foot on the ground is worth a word
 
 
@@ -64,7 +65,7 @@ def grounded(
     over = feet.lifts(
         heights, known, body.pairs, dt=dt, leg=abs(leg),
         # A body that never moves shows no flight either: the lowest foot is on the ground all the time.
-        window=dt if subject.fixed else _FLIGHT, most=np.inf if subject.fixed else 0.3,
+        window=dt if subject.fixed else _FLIGHT,
     )  # fmt: skip
     if over.held.any():
         progress.note(f"held up all the time: {', '.join(np.array(body.soles)[over.held])}")
@@ -98,14 +99,17 @@ def grounded(
     lift = np.stack([feet.clear(z, on, least=clearance) for z, on in zip(lift.T, standing.T, strict=True)], axis=1)
     airborne = float(np.mean(~standing[:, known].any(axis=1)))
     report |= {
-        "scale": scale,
+        "scale": float(scale),
         "standing_height_source": standing_height,
-        "stride_scale": paths.stride,
+        "stride_scale": float(paths.stride),
         "slide_removed_m": float(np.linalg.norm(np.diff(drift, axis=0), axis=1).sum()),
         "ground_drift_source": float(np.ptp(over.ground)),
         "held_up": [n for n, h in zip(body.soles, over.held, strict=True) if h],
         "airborne_fraction": airborne,
     }
+    drifted = report["ground_drift_source"] / standing_height
+    if drifted > _DRIFT:
+        progress.note(f"the ground under the feet rises and sinks by {drifted:.0%} of the leg: taken for drift")
     if paths.stride < 1:
         progress.note(f"strides shortened to {paths.stride:.0%}: the robot's legs reach no further")
     if airborne > _AIRBORNE:

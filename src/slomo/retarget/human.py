@@ -16,13 +16,13 @@ _WRISTS, _ANKLES = ("left_wrist", "right_wrist"), ("left_ankle", "right_ankle")
 _LOWER = (_HIPS, ("pelvis",))
 _UPPER = (_SHOULDERS, ("neck",), ("chest",), ("head",))
 PAIRS: Pairs = (_HIPS, _SHOULDERS)
-_TURN = 0.5  # s, standard deviation: arms and legs swing about the heading, and their mean over a stride is the heading
+_TURN = 0.5  # s, standard deviation of the window in which swinging arms and legs show the heading
 _TURNED_OUT = 0.8  # rad, toes further from the heading than this are not seen right
 
 
 def ends(limb: str) -> tuple[str, ...]:
-    """Key points of a foot and a hand, the first of which is needed."""
-    return (f"{limb}_ankle", f"{limb}_toe", f"{limb}_wrist")
+    """Key points of a leg and an arm, the first of which is needed."""
+    return tuple(f"{limb}_{n}" for n in ("ankle", "toe", "knee", "wrist", "elbow"))
 
 
 def trunk_of(motion: KeypointMotion, *, dt: float | None = None) -> Trunk:
@@ -40,11 +40,33 @@ def trunk_of(motion: KeypointMotion, *, dt: float | None = None) -> Trunk:
         up = np.broadcast_to([0.0, 0.0, 1.0], origin.shape)
     left = across(motion, PAIRS)
     if not np.any(left):
-        left = across(motion, (_ANKLES, _WRISTS)) * [1.0, 1.0, 0.0]
-        left = gaussian_filter1d(left, _TURN / (dt or float(np.median(np.diff(motion.t)))), axis=0, mode="nearest")
+        step = dt or float(np.median(np.diff(motion.t)))
+        left = _left_of_swinging(across(motion, (_ANKLES, _WRISTS)), window=_TURN / step)
     if not np.any(left):
         raise InvalidData("nothing tells left from right", where="key points", valid=[n for p in PAIRS for n in p])
     return Trunk(origin=origin, rotation=frame(up, left, axis="z"))
+
+
+def _left_of_swinging(d: Array, *, window: float) -> Array:
+    """(T, 3) horizontal direction to the left from d (T, 3), right to left between limbs that swing fore and aft.
+
+    In each window d is a constant to the left and a swing ahead, so left is where d changes least for its mean: this is
+    Fisher's discriminant (C + e I)^-1 m of mean m and covariance C. The mean alone would need whole strides.
+
+    Args:
+        window: standard deviation, in frames.
+    """
+    d = d[:, :2]
+
+    def mean(x: Array) -> Array:
+        flat = gaussian_filter1d(x.reshape(len(x), -1), window, axis=0, mode="constant")
+        return (flat / gaussian_filter1d(np.ones(len(x)), window, mode="constant")[:, None]).reshape(x.shape)
+
+    m = mean(d)
+    C = mean(d[:, :, None] * d[:, None]) - m[:, :, None] * m[:, None]
+    e = 0.01 * np.sum(m**2, axis=1) + 1e-6 * np.mean(np.sum(d**2, axis=1)) + 1e-300
+    left = np.linalg.solve(C + e[:, None, None] * np.eye(2), m[..., None])[..., 0]
+    return np.column_stack([left / np.maximum(np.linalg.norm(left, axis=1), 1e-300)[:, None], np.zeros(len(d))])
 
 
 def read(motion: KeypointMotion) -> Subject:
@@ -52,9 +74,10 @@ def read(motion: KeypointMotion) -> Subject:
     trunk, said = trunk_of(motion), []
     if not any(seen(motion, group) for group in _UPPER):
         said.append("nothing marks the upper body: it is kept upright, and shoulders are placed by usual proportions")
-    rest = load_skeleton("human").rest()
-    at = dict(zip(load_skeleton("human").names, rest, strict=True))
-    thigh_and_shank, ankle = at["left_hip"][2] - at["left_ankle"][2], at["left_ankle"][2] - at["left_toe"][2]
+    usual = load_skeleton("human")
+    at = dict(zip(usual.names, usual.rest(), strict=True))
+    thigh_and_shank = at["left_hip"][2] - at["left_ankle"][2]
+    ankle = at["left_ankle"][2] - at["left_toe"][2] + usual.sole
 
     feet, confidence, stands = [], [], []
     for side in SIDES:

@@ -1,7 +1,5 @@
 """The robot's body, hips, points and hands, from the paths of its soles: everything within reach."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
 from scipy.spatial.transform import Rotation
@@ -12,36 +10,27 @@ from slomo.robot import Robot
 
 Array = np.ndarray
 _LONGEST, _SHORTEST = 0.97, 1.1  # of the joints' reach: what planning leaves of it (see `pointfoot`)
+_LOWEST = 0.4  # of the leg: no lower does a body crouch
 _EASE = 0.1  # s, over which the body gives way to what legs can reach
 
 
-@dataclass(frozen=True)
-class Reach:
-    """Least and greatest distance (S,) m of a sole from its root."""
-
-    least: Array
-    most: Array
-
-    @classmethod
-    def of(cls, body: RobotBody) -> "Reach":
-        return cls(_SHORTEST * body.reach[:, 0], _LONGEST * body.reach[:, 1])
-
-
 def body_height(
-    z: Array, xy: Array, R: Rotation, soles: Array, standing: Array, body: RobotBody, *, dt: float
+    z: Array, xy: Array, R: Rotation, points: Array, standing: Array, robot: Robot, body: RobotBody, *, dt: float
 ) -> Array:
-    """Height (T,) m of the middle between the hips, changed where a standing sole would be out of reach.
+    """Height (T,) m of the middle between the hips, changed where a standing point would be out of reach.
 
     Args:
-        z: (T,) m wanted.  xy: (T, 2) m, the same point.  soles: (T, S, 3) m.  standing: (T, S) bool.  dt: s.
+        z: (T,) m wanted.  xy: (T, 2) m, the same point.  points: (T, C, 3) m.  standing: (T, C) bool.  dt: s.
     """
-    reach = Reach.of(body)
-    hips = np.stack([R.apply(r - body.root) for r in body.roots], axis=1)
-    across = np.linalg.norm(xy[:, None] + hips[..., :2] - soles[..., :2], axis=2)
-    tall = np.sqrt(np.maximum(reach.most**2 - across**2, (0.5 * reach.most) ** 2)) + soles[..., 2] - hips[..., 2]
-    low = np.sqrt(np.maximum(reach.least**2 - across**2, 0.0)) + soles[..., 2] - hips[..., 2]
-    ceiling = np.where(standing, tall, np.inf).min(axis=1)
-    floor = np.where(standing, np.maximum(low, 0.4 * body.leg + soles[..., 2] - hips[..., 2]), -np.inf).max(axis=1)
+    legs = [c for group in body.points for c in group]
+    points, standing = points[:, legs], standing[:, legs]
+    least, most = _limits(robot.leg_reach[legs])
+    hips = np.einsum("tij,cj->tci", R.as_matrix(), robot.nominal_hips[legs] - body.root)
+    over = points[..., 2] - hips[..., 2]  # height of the middle at which the hip is level with the point
+    across = np.linalg.norm(xy[:, None] + hips[..., :2] - points[..., :2], axis=2)
+    tall = np.sqrt(np.maximum(most**2 - across**2, (0.5 * most) ** 2)) + over
+    low = np.maximum(np.sqrt(np.maximum(least**2 - across**2, 0.0)), _LOWEST * body.leg) + over
+    ceiling, floor = np.where(standing, tall, np.inf).min(axis=1), np.where(standing, low, -np.inf).max(axis=1)
     n = 2 * round(_EASE / dt) | 1
     for limit, extreme, widest in ((floor, np.maximum, maximum_filter1d), (ceiling, np.minimum, minimum_filter1d)):
         change = widest(extreme(z, limit) - z, n, mode="nearest")
@@ -49,16 +38,33 @@ def body_height(
     return z
 
 
-def within_reach(soles: Array, hips: Array, standing: Array, ground: Array, body: RobotBody) -> tuple[Array, Array]:
-    """Soles (T, S, 3) m that swing, drawn to what their legs reach; and which ones were drawn (T, S) bool."""
-    reach = Reach.of(body)
-    leg = soles - hips
-    length = np.linalg.norm(leg, axis=2)
-    wanted = np.clip(length, reach.least, reach.most)
-    drawn = (wanted != length) & ~standing
-    moved = hips + leg * (wanted / np.maximum(length, 1e-9))[..., None]
-    moved[..., 2] = np.maximum(moved[..., 2], ground)
-    return np.where(drawn[..., None], moved, soles), drawn
+def _limits(reach: Array) -> tuple[Array, Array]:
+    return _SHORTEST * reach[:, 0], _LONGEST * reach[:, 1]
+
+
+def within_reach(
+    soles: Array, points: Array, hips: Array, free: Array, ground: Array, robot: Robot, body: RobotBody
+) -> tuple[Array, Array]:
+    """Soles that swing, drawn to where their points are within reach.
+
+    Args:
+        soles: (T, S, 3) m.  points, hips: (T, C, 3) m.  free: (T, S) bool, soles that may move.  ground: (T, S) m.
+
+    Returns:
+        (T, S, 3) m, and which ones were drawn (T, S) bool.
+    """
+    least, most = _limits(robot.leg_reach)
+    out, drawn = soles.copy(), np.zeros(free.shape, bool)
+    for s, columns in enumerate(body.points):
+        for c in columns * 2:  # what suits the toe may not suit the heel
+            leg = points[:, c] - soles[:, s] + out[:, s] - hips[:, c]
+            length = np.linalg.norm(leg, axis=1)
+            excess = np.clip(length, least[c], most[c]) / np.maximum(length, 1e-9) - 1
+            moved = free[:, s] & (np.abs(excess) > 1e-9)
+            drawn[:, s] |= moved
+            out[moved, s] += excess[moved, None] * leg[moved]
+            out[moved, s, 2] = np.maximum(out[moved, s, 2], ground[moved, s])
+    return out, drawn
 
 
 def points_of(soles: Array, pointing: Array, robot: Robot, body: RobotBody) -> Array:
@@ -78,10 +84,10 @@ def hands_of(hands: Hands | None, base: Array, R: Rotation, robot: Robot, body: 
     confidence = np.zeros((len(base), len(columns)))
     if hands is not None:
         known = np.any(hands.confidence > 0, axis=0)
-        least, most = robot.leg_reach[columns].T
-        offset = hands.offset * (_LONGEST * most)[:, None]
+        least, most = _limits(robot.leg_reach[columns])
+        offset = hands.offset * most[:, None]
         length = np.linalg.norm(offset, axis=2)
-        offset *= (np.clip(length, _SHORTEST * least, _LONGEST * most) / np.maximum(length, 1e-9))[..., None]
+        offset *= (np.clip(length, least, most) / np.maximum(length, 1e-9))[..., None]
         at[:, known] = (robot.nominal_hips[columns] + offset)[:, known]
         confidence[:, known] = hands.confidence[:, known]
     return base[:, None] + np.einsum("tij,tcj->tci", R.as_matrix(), at), confidence

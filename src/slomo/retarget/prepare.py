@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 _MARGIN = 0.15  # s, left out beside an impossible turn
 _TURN = 0.04  # s, standard deviation of the smoothing of the heading in which turns are looked for
+_BRIDGE = 0.02  # weight of a straight bridge over a gap: without, noise at a gap's ends would be extrapolated
+_NOISE = 0.02  # of the body's size
 _LONG_GAP = 0.3  # s, bridging more than this is worth a word
 
 
@@ -43,7 +45,7 @@ def prepare(
     report["source_hz"] = rate
     filled = clean.bridge(wanted)
     size = float(np.median(np.ptp(filled.positions, axis=1).max(axis=1)))
-    marked = clean.despike(filled, size=0.25 * size, window=0.5)
+    marked = clean.despike(wanted, size=0.25 * size, window=0.5)
     report["untrusted_samples"] = int((marked.confidence == 0).sum())
     _say_gaps(marked, report, progress)
     motion = clean.resample(clean.thin(clean.bridge(marked), config.rate), config.rate)
@@ -127,12 +129,13 @@ def _believable(
 
 
 def smoothed(motion: KeypointMotion, quick: set[str], config: "Config") -> KeypointMotion:
-    """Every key point smoothed, those in `quick` (feet and hands) less."""
+    """Every key point smoothed, those in `quick` (limbs) less."""
+    size = float(np.median(np.ptp(motion.positions, axis=1).max(axis=1)))
     positions = np.stack(
         [
             clean.smooth(
-                motion.positions[:, i], motion.confidence[:, i], dt=1 / config.rate,
-                cutoff=config.foot_cutoff if n in quick else config.body_cutoff,
+                motion.positions[:, i], np.maximum(motion.confidence[:, i], _BRIDGE), dt=1 / config.rate,
+                cutoff=config.foot_cutoff if n in quick else config.body_cutoff, least=_NOISE * size,
             )
             for i, n in enumerate(motion.names)
         ],

@@ -75,13 +75,20 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     walk = ground.grounded(subject, body, config, stepping, report, progress)
 
     dt = 1 / config.rate
-    paths, trunk = start_at_origin(walk.paths, walk.trunk)
+    paths, trunk = start_at_origin(walk.paths, walk.trunk, body)
     progress.update(0.7, "terrain")
     terrain = make_terrain(paths.soles, stepping, height=config.step_height)
     under = terrain.height(paths.soles)
     soles = np.concatenate([paths.soles, (under + walk.lift)[..., None]], axis=2)
     R = trunk.rotation
-    z = place.body_height(body.leg + walk.rise + under.mean(axis=1), paths.body, R, soles, walk.standing, body, dt=dt)
+    pointing = walk.pointing - walk.trunk.heading[0]
+    confidence, standing = np.ones((len(soles), len(robot.limbs))), np.zeros((len(soles), len(robot.limbs)), bool)
+    for s, columns in enumerate(body.points):
+        confidence[:, list(columns)] = subject.confidence[:, s, None]
+        standing[:, list(columns)] = walk.standing[:, s, None]
+    points = place.points_of(soles, pointing, robot, body)
+    wanted = body.leg + walk.rise + under.mean(axis=1)
+    z = place.body_height(wanted, paths.body, R, points, standing, robot, body, dt=dt)
     middle = np.column_stack([paths.body, z])
     base = middle - R.apply(body.root)
     roots = np.stack([base + R.apply(r) for r in body.roots], axis=1)
@@ -91,14 +98,10 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
         "tij,sj->tsi", R.as_matrix(), np.column_stack([body.home - body.roots[:, :2], 0 * body.home[:, 0]])
     )
     soles[:, unseen] = np.concatenate([(roots + offset)[:, unseen, :2], under[:, unseen, None]], axis=2)
-    soles, drawn = place.within_reach(soles, roots, walk.standing | unseen, under, body)
-    points = place.points_of(soles, walk.pointing - walk.trunk.heading[0], robot, body)
     hips = base[:, None] + np.einsum("tij,cj->tci", R.as_matrix(), robot.nominal_hips)
-
-    confidence, standing = np.ones((len(base), len(robot.limbs))), np.zeros((len(base), len(robot.limbs)))
-    for s, columns in enumerate(body.points):
-        confidence[:, list(columns)] = subject.confidence[:, s, None]
-        standing[:, list(columns)] = walk.standing[:, s, None]
+    points = place.points_of(soles, pointing, robot, body)
+    soles, drawn = place.within_reach(soles, points, hips, ~(walk.standing & walk.known), under, robot, body)
+    points = place.points_of(soles, pointing, robot, body)
     if body.hands:
         points[:, list(body.hands)], confidence[:, list(body.hands)] = place.hands_of(
             subject.hands, base, R, robot, body
@@ -110,7 +113,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
         positions=np.concatenate([base[:, None], hips, points], axis=1),
         names=names,
         confidence=np.concatenate([np.ones((len(base), 1 + len(robot.limbs))), confidence], axis=1),
-        contact=standing,
+        contact=standing.astype(float),
         contact_names=robot.key_points,
     )
     distance = np.linalg.norm(soles - roots, axis=2)
@@ -119,7 +122,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
         "heading_change_rad": float(trunk.heading[-1] - trunk.heading[0]),
         "distance_m": float(np.linalg.norm(np.diff(paths.body, axis=0), axis=1).sum()),
         "stance_fraction": dict(zip(body.soles, walk.standing.mean(axis=0).round(3).tolist(), strict=True)),
-        "body_moved_for_reach_m": float(np.abs(z - body.leg - walk.rise - under.mean(axis=1)).max()),
+        "body_moved_for_reach_m": float(np.abs(z - wanted).max()),
         "swings_drawn_fraction": float(drawn.mean()),
         "beyond_reach_fraction": float(beyond[:, walk.known].mean()),
         "unseen_limbs": [n for n, u in zip(body.soles, unseen, strict=True) if u],

@@ -11,6 +11,7 @@ from slomo.motion import KeypointMotion
 
 Array = np.ndarray
 Pairs = tuple[tuple[str, str], ...]
+_OFTEN = 0.2  # of the time: a body that is near level so much shows what level is
 _POSTURE = 0.35  # rad: up to here a mean tilt is a matter of where key points sit, from twice as much on a posture
 
 
@@ -35,12 +36,15 @@ class Trunk:
     def leveled(self, *, slope: float) -> tuple["Trunk", Array]:
         """Without the constant tilt that differently placed key points give, down to a ground of `slope` (rad, pitch).
 
-        A mean tilt is removed whole up to 0.35 rad and not at all from 0.7 rad on, where it is a posture.
+        It is told from the times when the body is within 0.35 rad of level, if there are such. Otherwise the mean tilt
+        is a posture the more, the larger it is, and from 0.7 rad on nothing is removed.
 
         Returns:
             The trunk, and the roll and pitch (2,) rad that were removed.
         """
-        mean = np.median(self.tilt, axis=0) - [0.0, slope]
+        tilt = self.tilt - [0.0, slope]
+        near = np.linalg.norm(tilt, axis=1) < _POSTURE
+        mean = np.median(tilt[near] if near.mean() > _OFTEN else tilt, axis=0)
         bias = mean * np.clip(2 - np.linalg.norm(mean) / _POSTURE, 0, 1)
         # Misplaced key points turn the frame within the body, whichever way the body looks.
         return Trunk(self.origin, self.rotation * Rotation.from_rotvec([*bias, 0.0]).inv()), bias
