@@ -215,6 +215,21 @@ def test_a_cycle_closes_and_repeats():
     assert checks["dynamics_residual"].value < 1e-5  # what the end misses, over one step
 
 
+def test_legs_that_joint_limits_keep_back_are_made_shorter():
+    """Feet far out beside a high body are within the model's legs, but not within the robot's joints."""
+    motion = trot(speed=0.0)
+    spread = motion.positions.copy()
+    for name, side in (("front_left", 1), ("hind_left", 1), ("front_right", -1), ("hind_right", -1)):
+        spread[:, motion.index(f"{name}_foot"), 1] += 0.16 * side
+    spread[:, [motion.index(n) for n in ("base", *(n for n in motion.names if n.endswith("_hip")))], 2] += 0.06
+    out = optimize(replace(motion, positions=spread))
+    report = out.json["report.json"]
+    assert out.failure is None
+    assert len(report["attempts"]) == 2
+    assert "legs made shorter" in report["attempts"][1]
+    assert report["joint_miss"] < 5e-3
+
+
 def test_no_cycle_without_swings():
     motion = trot()
     standing = replace(motion, positions=np.tile(motion.positions[:1], (len(motion.t), 1, 1)))

@@ -1,8 +1,9 @@
 """From targets to a reference that verifies: the solver asked for, and what is tried when the verifier objects.
 
 What the point-foot model cannot know of the whole robot comes back from the verifier: where joints would be overloaded
-the forces of that limb are limited further, and where feet creep too far they are made to stick. Nothing else is
-changed, each attempt is told, and the last word is the verifier's.
+the forces of that limb are limited further, where joint limits keep a foot from its place the leg is made shorter, and
+where feet creep too far they are made to stick. Nothing else is changed, each attempt is told, and the last word is the
+verifier's.
 """
 
 import importlib
@@ -10,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from slomo.motion import Reference
 from slomo.optimize import problem
@@ -35,6 +37,7 @@ SOLVERS = {
     "ipopt": ("slomo.optimize.ipopt", "solve_ipopt", "IPOPT, complementarity constraints"),
 }
 ATTEMPTS = 5
+_MISSED, _MARGIN = 1e-3, 1.3  # m from which on a miss counts, and by what factor of it a leg is made shorter
 _TIGHTER = 0.9  # of the force that would keep a joint just within its torque limit
 
 
@@ -97,7 +100,7 @@ def make_plan(
         task = problem.make_task(model, want, terrain, wish.weights, steps=steps)
         return task._replace(cyclic=True, shift=end_shift(want)) if wish.cyclic else task
 
-    run = _solver(wish.solver)
+    run, legs = _solver(wish.solver), model
 
     def solve(task: Task, start: Iterate | None, settings: Settings = wish.settings) -> Solution:
         nonlocal seconds
@@ -105,7 +108,7 @@ def make_plan(
             start = problem.make_start(model, want, task)
         else:
             settings = replace(settings, kappas=settings.kappas[-2:])
-        solution = run(model, task, start, terrain=terrain, settings=settings, report=report)
+        solution = run(legs, task, start, terrain=terrain, settings=settings, report=report)
         seconds += solution.seconds
         return solution
 
@@ -130,6 +133,8 @@ def make_plan(
             settings, why = replace(settings, strict=True), "loaded feet made to stick"
         elif "torque_ratio" in wrong:
             task, why = _limit_forces(robot, reference, task), "forces limited where joints were overloaded"
+        elif "joint_miss" in wrong:
+            legs, why = _shorten_legs(robot, reference, legs), "legs made shorter where joint limits kept a foot back"
         else:
             break
         report(0.0, why)
@@ -167,3 +172,24 @@ def _limit_forces(robot: Robot, reference: Reference, task: Task) -> Task:
             u_high[k, columns] = np.minimum(u_high[k, columns], most)
             u_low[k, columns] = np.maximum(u_low[k, columns], -most)
     return task._replace(u_low=u_low, u_high=u_high)
+
+
+def _shorten_legs(robot: Robot, reference: Reference, model: PointFootModel) -> PointFootModel:
+    """The model with less room for the length of a leg whose foot the joints cannot bring where the reference has it.
+
+    The hip of the model stands still, the robot's moves with the joints above it: spread legs reach less far.
+    """
+    r, miss = reference, joint_motion(robot, reference).miss
+    hips = r.q[:, None, :3] + np.stack([Rotation.from_quat(r.q[:, 3:7]).apply(h) for h in model.hips], axis=1)
+    length = np.linalg.norm(hips - r.points, axis=2)
+    stretched = length > (model.leg_min + model.leg_max) / 2
+    room = (miss > _MISSED) * _MARGIN * miss
+    return replace(
+        model,
+        leg_max=np.minimum(
+            model.leg_max, np.where(stretched, length - room, np.inf).min(axis=0, initial=np.inf, where=room > 0)
+        ),
+        leg_min=np.maximum(
+            model.leg_min, np.where(stretched, 0.0, length + room).max(axis=0, initial=0.0, where=room > 0)
+        ),
+    )
