@@ -72,6 +72,10 @@ def test_derivatives_against_finite_differences():
     h, lam = rng.uniform(0.3, 0.6, K + 1), 30 * rng.normal(size=(K, 4, 3))
     D, kinematics = model.steps(q, h, lam).D, model.kinematics(q)
     assert D is not None
+    coupled, moved = model.structure()
+    assert np.all(coupled[:6]) and coupled[6:, 6:].sum() == 4 * 3 * 3
+    assert not np.any(D[:, :, ~coupled])
+    assert not np.any(kinematics.J[:, ~moved.repeat(3, axis=0).reshape(4, 3, nv)])
     for i in range(nv):
         for n in range(K + 2):
             d = np.zeros((K + 2, nv))

@@ -98,6 +98,15 @@ class WholeBodyModel:
         self.base = robot.model.getFrameId(robot.base)
         self.nj = robot.model.nv - 6
 
+    def structure(self) -> tuple[Array, Array]:
+        """Where derivatives can differ from zero: of a joint's equation by a joint (nv, nv), only along one branch of the
+        tree, and of a point by a joint (C, nv)."""
+        model, nv = self.model, self.model.nv
+        joints = [1] * 6 + list(range(2, model.njoints))
+        above = np.array([[j in model.supports[i] for j in joints] for i in joints])
+        on = [model.supports[model.frames[f].parentJoint] for f in self.points]
+        return above | above.T, np.array([[j in s for j in joints] for s in on]).reshape(-1, nv)
+
     def velocities(self, q: Array, h: Array) -> Array:
         """(K + 1, nv) velocities between the knots q (K + 2, nq), with steps h (K + 1,) s."""
         return minus(q[1:], q[:-1]) / h[:, None]

@@ -101,7 +101,7 @@ class Problem:
         self.reference, self.start = reference, start
         self.h = np.concatenate([reference.h[:1], reference.h])
         self.base = reference.q[:, :7]
-        self.layout = Layout(len(reference.t), len(reference.point_names), model.nj)
+        self.layout = Layout(len(reference.t), *model.structure())
         # Of the damping, for steps of 1 rad or m and of 300 N.
         self.scale = np.zeros(self.layout.n)
         self.scale[self.layout.dq], self.scale[self.layout.lam] = 1.0, 1e-5

@@ -74,7 +74,10 @@ class Penalties(NamedTuple):
 class Layout:
     """Columns of the unknowns, each an array of column numbers."""
 
-    def __init__(self, T: int, C: int, nj: int):
+    def __init__(self, T: int, coupled: Array, moved: Array):
+        """Of T knots; coupled (nv, nv) and moved (C, nv) as of `WholeBodyModel.structure`."""
+        self.coupled, self.moved = coupled, moved
+        C, nj = len(moved), len(coupled) - 6
         self.T, self.K, self.C, self.nj, self.nv = T, T - 1, C, nj, 6 + nj
         self.n = 0
         self.dq = self._take(T + 1, self.nv)
@@ -103,24 +106,20 @@ class _Rows:
 
     def __init__(self):
         self.count = 0
-        self.data: list[tuple[Array, Array, Array]] = []
+        self.data: list[tuple[Array, ...]] = []
         self.b: list[Array] = []
 
-    def add(self, b: Array, *blocks: tuple[Array, Array]) -> None:
+    def add(self, b: Array, *blocks: tuple[Array, ...]) -> None:
         """Rows sum_i values_i x[columns_i] with right-hand side b (..., r); columns (..., c), values (..., r, c) or of
-        a shape that broadcasts to it."""
+        a shape that broadcasts to it, and where they can differ from zero, of such a shape, if not everywhere."""
         rows = self.count + np.arange(b.size).reshape(b.shape)
         self.count += b.size
         self.b.append(b.ravel())
-        for columns, values in blocks:
+        for columns, values, *where in blocks:
             shape = (*b.shape, columns.shape[-1])
-            self.data.append(
-                (
-                    np.broadcast_to(rows[..., None], shape).ravel(),
-                    np.broadcast_to(columns[..., None, :], shape).ravel(),
-                    np.broadcast_to(values, shape).ravel(),
-                )
-            )
+            kept = np.broadcast_to(where[0] if where else True, shape)
+            parts = rows[..., None], columns[..., None, :], values
+            self.data.append(tuple(np.broadcast_to(x, shape)[kept] for x in parts))
 
     def matrix(self, n: int) -> tuple[sp.csc_matrix, Array]:
         rows, columns, values = (np.concatenate(x) for x in zip(*self.data, strict=True))
@@ -184,18 +183,20 @@ class Program:
 
     def _rows(self, x: Linearized) -> tuple[sp.csc_matrix, Array, int, int]:
         layout, limits, rows = self.layout, self.limits, _Rows()
-        K, C, nj, nv = layout.K, layout.C, layout.nj, layout.nv
+        K, C, nj = layout.K, layout.C, layout.nj
         one = np.ones((1, 1))
         # Dynamics: force + D dq - Jt lam = (slack, tau).
-        pick = np.zeros((nv, nj))
-        pick[6:] = np.eye(nj)
         knots = np.concatenate([layout.dq[:-2], layout.dq[1:-1], layout.dq[2:]], axis=1)
         D = np.concatenate([x.D[:, 0], x.D[:, 1], x.D[:, 2]], axis=2)
         lam = layout.lam.reshape(K, -1)
+        chain, lever = np.tile(layout.coupled, 3), np.repeat(layout.moved.T, 3, axis=1)
+        slack, own, axis = np.kron(np.eye(6), [[1.0, -1.0]]), np.eye(nj), np.eye(3)
         rows.add(-x.force[:, :6], (knots, D[:, :6]), (lam, -x.Jt[:, :6]),
-                 (layout.s_base.reshape(K, 12), np.kron(np.eye(6), [[1.0, -1.0]])))  # fmt: skip
-        rows.add(-x.force[:, 6:], (knots, D[:, 6:]), (lam, -x.Jt[:, 6:]), (layout.tau, -np.eye(nj)))
-        rows.add(np.zeros((K + 1, C, 3)), (layout.dp, np.eye(3)), (layout.dq[1:, None], -x.J))
+                 (layout.s_base.reshape(K, 12), slack, slack != 0))  # fmt: skip
+        rows.add(-x.force[:, 6:], (knots, D[:, 6:], chain[6:]), (lam, -x.Jt[:, 6:], lever[6:]),
+                 (layout.tau, -own, own != 0))  # fmt: skip
+        rows.add(np.zeros((K + 1, C, 3)), (layout.dp, axis, axis != 0),
+                 (layout.dq[1:, None], -x.J, layout.moved[:, None]))  # fmt: skip
         equations = rows.count
         # Limits of the joints.
         q, dq = x.q_joints, layout.dq[..., 6:, None]
