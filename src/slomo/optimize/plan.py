@@ -182,14 +182,12 @@ def _shorten_legs(robot: Robot, reference: Reference, model: PointFootModel) -> 
     r, miss = reference, joint_motion(robot, reference).miss
     hips = r.q[:, None, :3] + np.stack([Rotation.from_quat(r.q[:, 3:7]).apply(h) for h in model.hips], axis=1)
     length = np.linalg.norm(hips - r.points, axis=2)
-    stretched = length > (model.leg_min + model.leg_max) / 2
+    middle = (model.leg_min + model.leg_max) / 2
     room = (miss > _MISSED) * _MARGIN * miss
+    longest = np.where((room > 0) & (length > middle), length - room, np.inf).min(axis=0)
+    shortest = np.where((room > 0) & (length <= middle), length + room, 0.0).max(axis=0)
     return replace(
         model,
-        leg_max=np.minimum(
-            model.leg_max, np.where(stretched, length - room, np.inf).min(axis=0, initial=np.inf, where=room > 0)
-        ),
-        leg_min=np.maximum(
-            model.leg_min, np.where(stretched, 0.0, length + room).max(axis=0, initial=0.0, where=room > 0)
-        ),
+        leg_max=np.minimum(model.leg_max, np.maximum(longest, (middle + model.leg_max) / 2)),
+        leg_min=np.maximum(model.leg_min, np.minimum(shortest, (middle + model.leg_min) / 2)),
     )
