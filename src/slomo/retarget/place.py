@@ -10,7 +10,8 @@ from slomo.robot import Robot
 
 Array = np.ndarray
 _LONGEST, _SHORTEST = 0.97, 1.1  # of the joints' reach: what planning leaves of it (see `pointfoot`)
-_LOWEST = 0.4  # of the leg: no lower does a body crouch
+_LOWEST = {"paw": 0.4, "foot": 0.65}  # of the leg: no lower does a body crouch over paws and over level feet
+_ANKLE = 0.6  # rad, how far ankles bend forward at ease
 _EASE = 0.1  # s, over which the body gives way to what legs can reach
 
 
@@ -29,7 +30,10 @@ def body_height(
     over = points[..., 2] - hips[..., 2]  # height of the middle at which the hip is level with the point
     across = np.linalg.norm(xy[:, None] + hips[..., :2] - points[..., :2], axis=2)
     tall = np.sqrt(np.maximum(most**2 - across**2, (0.5 * most) ** 2)) + over
-    low = np.maximum(np.sqrt(np.maximum(least**2 - across**2, 0.0)), _LOWEST * body.leg) + over
+    low = (
+        np.maximum(np.sqrt(np.maximum(least**2 - across**2, 0.0)), _LOWEST["foot" if body.length else "paw"] * body.leg)
+        + over
+    )
     ceiling, floor = np.where(standing, tall, np.inf).min(axis=1), np.where(standing, low, -np.inf).max(axis=1)
     n = 2 * round(_EASE / dt) | 1
     for limit, extreme, widest in ((floor, np.maximum, maximum_filter1d), (ceiling, np.minimum, minimum_filter1d)):
@@ -67,10 +71,37 @@ def within_reach(
     return out, drawn
 
 
-def points_of(soles: Array, pointing: Array, robot: Robot, body: RobotBody) -> Array:
-    """(T, C, 3) m: each sole's points, toe and heel level and apart as on the robot; hands are left at 0."""
+def droop(
+    soles: Array, roots: Array, heading: Array, free: Array, ground: Array, body: RobotBody, *, dt: float
+) -> Array:
+    """(T, S) rad by which the toes of swinging feet hang down, where a level foot would ask too much of the ankle.
+
+    With thigh and shank of one length, a foot at distance d from its hip leans the shank forward by acos(d / straight
+    leg) more than the line from hip to foot, and that is the ankle's angle if the foot is level.
+
+    Args:
+        soles, roots: (T, S, 3) m.  heading: (T,) rad.  free: (T, S) bool, feet that swing.  ground: (T, S) m.  dt: s.
+    """
+    if not body.length:
+        return np.zeros(free.shape)
+    leg = soles - roots
+    ahead = leg[..., 0] * np.cos(heading)[:, None] + leg[..., 1] * np.sin(heading)[:, None]
+    straight = np.arccos(np.clip(np.linalg.norm(leg, axis=2) / body.reach[:, 1], -1, 1))
+    lean = straight - np.arctan2(ahead, -leg[..., 2])
+    down = gaussian_filter1d(np.where(free, np.maximum(lean - _ANKLE, 0.0), 0.0), _EASE / dt / 2, axis=0)
+    room = np.arcsin(np.clip(2 * (soles[..., 2] - ground) / body.length, 0, 1))  # the toes stay over the ground
+    return np.minimum(down, room) * free
+
+
+def points_of(soles: Array, pointing: Array, down: Array, robot: Robot, body: RobotBody) -> Array:
+    """(T, C, 3) m: each sole's points, toe and heel as far apart as on the robot; hands are left at 0.
+
+    Args:
+        soles: (T, S, 3) m.  pointing: (T, S) rad, heading of the toes.  down: (T, S) rad, how far they hang.
+    """
     out = np.zeros((len(soles), len(robot.limbs), 3))
-    ahead = np.stack([np.cos(pointing), np.sin(pointing), np.zeros_like(pointing)], axis=2)
+    level = np.cos(down)
+    ahead = np.stack([level * np.cos(pointing), level * np.sin(pointing), -np.sin(down)], axis=2)
     for s, points in enumerate(body.points):
         for c, sign in zip(points, (0.5, -0.5) if body.length else (0.0,), strict=True):
             out[:, c] = soles[:, s] + sign * body.length * ahead[:, s]

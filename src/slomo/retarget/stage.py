@@ -86,7 +86,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     for s, columns in enumerate(body.points):
         confidence[:, list(columns)] = subject.confidence[:, s, None]
         standing[:, list(columns)] = walk.standing[:, s, None]
-    points = place.points_of(soles, pointing, robot, body)
+    points = place.points_of(soles, pointing, np.zeros_like(pointing), robot, body)
     wanted = body.leg + walk.rise + under.mean(axis=1)
     z = place.body_height(wanted, paths.body, R, points, standing, robot, body, dt=dt)
     middle = np.column_stack([paths.body, z])
@@ -99,9 +99,11 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     )
     soles[:, unseen] = np.concatenate([(roots + offset)[:, unseen, :2], under[:, unseen, None]], axis=2)
     hips = base[:, None] + np.einsum("tij,cj->tci", R.as_matrix(), robot.nominal_hips)
-    points = place.points_of(soles, pointing, robot, body)
-    soles, drawn = place.within_reach(soles, points, hips, ~(walk.standing & walk.known), under, robot, body)
-    points = place.points_of(soles, pointing, robot, body)
+    free = ~(walk.standing & walk.known)
+    down = place.droop(soles, roots, trunk.heading, free, under, body, dt=dt)
+    points = place.points_of(soles, pointing, down, robot, body)
+    soles, drawn = place.within_reach(soles, points, hips, free, under, robot, body)
+    points = place.points_of(soles, pointing, down, robot, body)
     if body.hands:
         points[:, list(body.hands)], confidence[:, list(body.hands)] = place.hands_of(
             subject.hands, base, R, robot, body
