@@ -56,13 +56,93 @@ def test_exchanged_sides_are_put_right_and_said(tmp_path):
     assert any("exchanged" in n for n in notes)
 
 
+def person_frames(*, hands_first: bool = True, up: float = 1.0, arms: float = 1.0) -> np.ndarray:
+    """(60, 18): a person who steps on the spot and moves the arms, whose hands are `arms` over the hips."""
+    t = np.linspace(0, 3, 60)
+    zero = np.zeros_like(t)
+    root = np.stack([zero, 0.02 * np.sin(4 * t), 1.0 + zero], axis=1)
+    lift = 0.1 * np.clip(np.sin(5 * t + np.array([[0], [np.pi]])), 0, 1)
+    foot = [np.stack([zero, y + zero, z], axis=1) for y, z in zip((0.1, -0.1), lift, strict=True)]
+    hand = [root + np.stack([0.2 * np.sin(5 * t), y + zero, arms + 0.3 * np.cos(3 * t)], axis=1) for y in (0.4, -0.4)]
+    points = np.stack([root, *(hand + foot if hands_first else foot + hand)], axis=1)
+    if up < 0:
+        points[..., 1:] *= -1
+    angles = np.tile([1.6, 0.0, 1.6], (60, 1))
+    return np.concatenate([points[:, 0], angles, points[:, 1:].reshape(60, 12)], axis=1)
+
+
 @pytest.mark.parametrize("hands_first", [True, False])
-def test_person_hands_are_told_from_feet(tmp_path, hands_first):
+@pytest.mark.parametrize("up", [1.0, -1.0])
+@pytest.mark.parametrize("arms", [0.8, -0.1])
+def test_person_hands_and_up_are_told_from_feet_that_stand(tmp_path, hands_first, up, arms):
+    notes: list[str] = []
+    frames = person_frames(hands_first=hands_first, up=up, arms=arms)
+    motion = load_keypoints(write(tmp_path / "p.json", frames, dt=0.05), note=notes.append)
+    assert motion.names == ("pelvis", "left_wrist", "right_wrist", "left_ankle", "right_ankle")
+    straight = load_keypoints(write(tmp_path / "q.json", person_frames(arms=arms), dt=0.05))
+    np.testing.assert_allclose(motion.positions, straight.positions, atol=1e-9)
+    assert any(f"{'hands' if hands_first else 'feet'} first" in n for n in notes)
+    assert any("z points down" in n for n in notes) == (up < 0)
+    assert any("first of each pair counts as the left one" in n for n in notes)
+
+
+def test_person_whose_hands_stand_as_still_as_the_feet_is_refused(tmp_path):
+    frames = person_frames(arms=0.9)
+    frames[:, 6:18] = frames[:1, 6:18]
+    with pytest.raises(InvalidData, match=r"cannot tell up from down: with z (up|down) and with z (up|down)"):
+        load_keypoints(write(tmp_path / "p.json", frames))
+
+
+def test_exchanged_hands_are_put_right_and_crossing_ones_refused(tmp_path):
+    notes: list[str] = []
+    frames = person_frames()
+    exchanged = frames[:, [*range(6), 9, 10, 11, 6, 7, 8, *range(12, 18)]]
+    got = load_keypoints(write(tmp_path / "a.json", exchanged, dt=0.05), note=notes.append)
+    np.testing.assert_allclose(got.positions, load_keypoints(write(tmp_path / "b.json", frames, dt=0.05)).positions)
+    assert any("hands exchanged" in n for n in notes)
+    half = np.concatenate([frames[:30], exchanged[30:]])
+    with pytest.raises(InvalidData, match="which hand is on which foot's side"):
+        load_keypoints(write(tmp_path / "c.json", half, dt=0.05))
+
+
+def test_person_who_would_walk_backwards_is_turned_round(tmp_path):
+    notes: list[str] = []
+    frames = person_frames()
+    walked = np.linspace(0, -4, len(frames))[:, None]
+    frames[:, [0, 6, 9, 12, 15]] += walked
+    motion = load_keypoints(write(tmp_path / "p.json", frames, dt=0.05), note=notes.append)
+    assert any("walk backwards" in n for n in notes)
+    assert motion["left_ankle"][0, 1] < motion["right_ankle"][0, 1]
+
+
+@pytest.mark.parametrize(("order", "sign"), [([0, 2, 1], 1.0), ([0, 2, 1], -1.0), ([2, 1, 0], 1.0)])
+def test_another_axis_may_be_up_where_z_makes_no_sense(tmp_path, order, sign):
+    notes: list[str] = []
     frames = animal_frames()
-    columns = slice(6, 12) if hands_first else slice(12, 18)
-    frames[:, columns] += np.tile([0, 0, 1.2], 2)
-    motion = load_keypoints(write(tmp_path / "p.json", frames))
-    assert motion["left_wrist"][0, 2] > 1 > motion["left_ankle"][0, 2]
+    points = np.concatenate([frames[:, :3], frames[:, 6:]], axis=1).reshape(-1, 5, 3)[..., order] * 1.0
+    points[..., order.index(2)] *= sign
+    points[..., 0 if order[0] == 0 else 1] *= -sign  # a rotation, not a mirror
+    moved = np.concatenate([points[:, 0], frames[:, 3:6], points[:, 1:].reshape(len(frames), 12)], axis=1)
+    motion = load_keypoints(write(tmp_path / "a.json", moved), note=notes.append)
+    assert motion["pelvis"][0, 2] - motion["hind_left_paw"][0, 2] == pytest.approx(1.0)
+    assert any("so that z is up" in n for n in notes)
+    axes = np.stack([motion["withers"] - motion["pelvis"], motion["front_left_paw"] - motion["front_right_paw"]])[:, 0]
+    assert np.cross(axes[0], axes[1])[2] > 0
+
+
+def test_heading_is_told_where_the_angle_runs_the_other_way(tmp_path):
+    frames = animal_frames()
+    t = np.linspace(0, 1, len(frames))
+    c, s = np.cos(t), np.sin(t)
+    points = np.concatenate([frames[:, :3], frames[:, 6:]], axis=1).reshape(-1, 5, 3)
+    points[..., :2] = np.stack([c[:, None] * points[..., 0] - s[:, None] * points[..., 1],
+                                s[:, None] * points[..., 0] + c[:, None] * points[..., 1]], axis=2)  # fmt: skip
+    for sign in (1.0, -1.0):
+        frames[:, 3] = sign * t + 0.7
+        whole = np.concatenate([points[:, 0], frames[:, 3:6], points[:, 1:].reshape(len(frames), 12)], axis=1)
+        motion = load_keypoints(write(tmp_path / "a.json", whole))
+        along = (motion["withers"] - motion["pelvis"])[:, :2]
+        np.testing.assert_allclose(np.unwrap(np.arctan2(along[:, 1], along[:, 0])), t, atol=0.02)
 
 
 def test_undecidable_limbs_fail_clearly(tmp_path):
@@ -131,3 +211,18 @@ def test_published_animals(name):
     rise = (motion["withers"] - motion["pelvis"])[26:109, 2]
     step = sum(motion[f"front_{s}_paw"] - motion[f"hind_{s}_paw"] for s in ("left", "right"))[26:109, 2]
     assert np.corrcoef(rise, step)[0, 1] > 0.3
+
+
+def test_published_person():
+    path = SHARED / "human_jumping_jack.json"
+    if not path.exists():
+        pytest.skip("shared key-point files are not beside this checkout")
+    notes: list[str] = []
+    motion = load_keypoints(path, note=notes.append)
+    assert "z points down in this file: turned by 180 degrees about x" in notes
+    assert "a person, hands first" in notes
+    feet = np.minimum(motion["left_ankle"], motion["right_ankle"])[:, 2]
+    hands = (motion["left_wrist"] + motion["right_wrist"])[:, 2] / 2
+    # Jumping jacks: the hands go from the hips to over the head, the lower foot stays where it is.
+    assert np.ptp(feet) < 0.15 < 0.5 < np.ptp(hands)
+    assert motion["pelvis"][0, 2] > feet.max() + 0.5
