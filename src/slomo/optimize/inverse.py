@@ -47,6 +47,7 @@ class JointMotion:
         root_wrench: (T - 1, 6) N and N m in the root's frame that no motor gives: what the point-foot model misses of
             the whole robot.
         miss: (T, C) m, distance of the contact frames from their points.
+        reached: (T, C, 3) m, where the contact frames are, world.
     """
 
     q: Array
@@ -55,6 +56,7 @@ class JointMotion:
     tau_static: Array
     root_wrench: Array
     miss: Array
+    reached: Array
 
 
 def joint_motion(robot: Robot, reference: Reference) -> JointMotion:
@@ -70,10 +72,10 @@ def joint_motion(robot: Robot, reference: Reference) -> JointMotion:
     q[:, :7], v[:, :6] = root[:, :7], root[:, 7:]
     nominal = np.tile(robot.q_nominal[7:], (T, 1))
     keep = np.exp(-np.concatenate([[np.inf], r.h]) / RETURN)
-    q[:, 7:], miss = legs.sweep(root[:, :7], r.points, nominal, keep)
+    q[:, 7:], error = legs.sweep(root[:, :7], r.points, nominal, keep)
     if nj > len(legs.error):
         home = gaussian_filter1d(q[:, 7:], SMOOTHING * (T - 1) / (r.t[-1] - r.t[0]), axis=0, mode="nearest")
-        q[:, 7:], miss = legs.sweep(root[:, :7], r.points, home, np.zeros(T))
+        q[:, 7:], error = legs.sweep(root[:, :7], r.points, home, np.zeros(T))
     v[1:, 6:] = np.diff(q[:, 7:], axis=0) / r.h[:, None]
     v[0, 6:] = legs.velocities(q[0], v[0, :6], v[1, 6:], r.v[0, 6:])
 
@@ -84,7 +86,8 @@ def joint_motion(robot: Robot, reference: Reference) -> JointMotion:
         force = pin.rnea(model, legs.data, q[k], v[k], a) - J.T @ r.lam[k].ravel()
         wrench[k], tau[k] = force[:6], force[6:]
         tau_static[k] = -J[:, 6:].T @ r.u[k]
-    return JointMotion(q, v, tau, tau_static, wrench, miss)
+    miss = np.linalg.norm(error, axis=2)
+    return JointMotion(q, v, tau, tau_static, wrench, miss, reached=r.points - error)
 
 
 class _Legs:
@@ -150,17 +153,17 @@ class _Legs:
         return out
 
     def sweep(self, root: Array, points: Array, home: Array, keep: Array) -> tuple[Array, Array]:
-        """`solve` at every knot, each from the one before: joints (T, nj) rad and what they miss (T, C) m.
+        """`solve` at every knot, each from the one before: joints (T, nj) rad and what is missing (T, C, 3) m.
 
         Args:
             home: (T, nj) rad.  keep: (T,) share of the last knot's angles in the home of each.
         """
-        joints, miss = np.empty(home.shape), np.empty(points.shape[:2])
+        joints, error = np.empty(home.shape), np.empty(points.shape)
         last = home[0]
         for k in range(len(root)):
             last = joints[k] = self.solve(root[k], last, points[k], keep[k] * last + (1 - keep[k]) * home[k])
-            miss[k] = np.linalg.norm(self.error[: points[k].size].reshape(-1, 3), axis=1)
-        return joints, miss
+            error[k] = self.error[: points[k].size].reshape(-1, 3)
+        return joints, error
 
     def solve(self, root: Array, joints: Array, points: Array, home: Array) -> Array:
         """(nj,) rad that bring the contact frames to points (C, 3), from a first guess, with the root at (7,)."""
