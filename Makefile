@@ -1,6 +1,7 @@
 # make demo   sets up .venv, turns the embedded clip into a robot's motion, ends with pictures and numbers
 # make test   unit tests and an end-to-end smoke test     make check  ruff and pyright
 # make train-prior   pictures, then the networks of src/slomo/prior/weights, from nothing: within the hour on two cores
+# make bench  the solvers of `slomo optimize` side by side, and with longer motions          (BENCH="--cap 60 --json")
 # make bench-prior   those networks alone against truth      (WEIGHTS=folder: others; BENCH="--truth ... --masks ...")
 # make bench-parts   reconstruction without each of its parts
 # make bench-terms   reconstruction with and without each term of the prior   (BENCH="--seeds 5 --terms some")
@@ -14,7 +15,7 @@ STEPS_human     := 4000
 PRIOR  := prior-training
 SHIPPED := src/slomo/prior/weights
 
-.PHONY: demo test slow check clean train-prior bench-prior bench-terms bench-parts $(KINDS:%=train-%)
+.PHONY: demo test slow check clean train-prior bench bench-prior bench-terms bench-parts $(KINDS:%=train-%)
 .DELETE_ON_ERROR:
 
 demo: .venv/run.stamp
@@ -41,6 +42,9 @@ train-prior: .venv/dev.stamp
 $(KINDS:%=train-%): train-%: .venv/dev.stamp
 	.venv/bin/slomo dataset $(PRIOR)/data --kind $* --samples 9600
 	OMP_NUM_THREADS=1 .venv/bin/python -m slomo.prior.train $(PRIOR)/data $(PRIOR) --kind $* --steps $(STEPS_$*)
+
+bench: .venv/dev.stamp
+	OMP_NUM_THREADS=1 .venv/bin/python tests/bench_optimize.py $(BENCH)
 
 bench-prior: .venv/dev.stamp
 	OMP_NUM_THREADS=1 .venv/bin/python tests/bench_prior.py $(if $(WEIGHTS),--weights $(WEIGHTS)) $(BENCH)

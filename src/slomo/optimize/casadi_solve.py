@@ -19,6 +19,8 @@ from slomo.terrain import Terrain
 Array = np.ndarray
 Report = Callable[[float, str], None]
 
+SECONDS = 600.0  # of solving, after which it is given up
+
 
 class Form(Protocol):
     """How the task becomes a problem with the unknowns z (N, nz) at the knots and the end state."""
@@ -49,14 +51,14 @@ class Plugin:
 
     Attributes:
         name: as `casadi.nlpsol` knows it.  title: for messages.
-        options: from (iterations, seconds that remain) to its options.
-        seconds: after which a solve is given up; a solver may overrun it by one run at one kappa if it cannot stop.
+        options: from (most iterations, seconds that remain) to its options.
+        seconds: after which a solve is given up.
     """
 
     name: str
     title: str
     options: Callable[[int, float], Mapping[str, Any]]
-    seconds: float = np.inf
+    seconds: float = SECONDS
 
 
 def run(
@@ -90,14 +92,13 @@ def run(
                 status = "time limit"
                 break
             report((n + turn / settings.rounds) / len(settings.kappas), f"{plugin.title}, kappa {kappa:g} N m")
-            result = control.solve(
-                z,
-                end,
-                form.parameters(task, kappa),
-                low=low,
-                high=high,
-                options=plugin.options(settings.iterations, remaining),
-            )
+            # A solver that cannot look at the clock itself gets as many iterations as the time will do.
+            spent = plugin.seconds - remaining
+            most = settings.iterations
+            if iterations:
+                most = min(most, 1 + int(remaining * iterations / max(spent, 1e-3)))
+            options = plugin.options(most, remaining)
+            result = control.solve(z, end, form.parameters(task, kappa), low=low, high=high, options=options)
             iterations += result.iterations
             if not np.all(np.isfinite(result.z)):
                 status = "not finite"
@@ -105,6 +106,8 @@ def run(
             z, end, cost = result.z, result.end, result.cost
             it = form.unpack(task, z, end, kappa)
             status = "converged" if result.success else result.status
+            if status == "iteration limit" and most < settings.iterations:
+                status = "time limit"
             ground = terrain.planes(it.qs[:, 7:].reshape(len(it.qs), -1, 3))
             moved = not np.allclose(ground, task.ground, rtol=0, atol=1e-9)
             if last and result.success and moved:

@@ -19,7 +19,7 @@ import numpy as np
 
 from slomo.optimize import casadi_model as cm
 from slomo.optimize.casadi_nlp import Fields, Knot
-from slomo.optimize.casadi_solve import Plugin, run
+from slomo.optimize.casadi_solve import SECONDS, Plugin, run
 from slomo.optimize.contact import tangents
 from slomo.optimize.cost import Task
 from slomo.optimize.dynamics import Body, step
@@ -29,8 +29,6 @@ from slomo.pointfoot import PointFootModel
 from slomo.terrain import Terrain
 
 Array = np.ndarray
-
-SECONDS = 600.0  # of solving, after which it is given up
 
 
 def _directions(plane: ca.SX) -> ca.SX:
@@ -150,8 +148,8 @@ def solve_ipopt(
     def options(iterations: int, remaining: float) -> dict[str, object]:
         return {
             "ipopt": {
-                "print_level": 0, "sb": "yes", "linear_solver": "mumps", "max_iter": iterations, "tol": 1e-8,
-                "max_wall_time": float(min(remaining, 1e6)), "bound_relax_factor": 1e-10,
+                "print_level": 0, "sb": "yes", "linear_solver": "mumps", "max_iter": iterations, "tol": 1e-6,
+                "constr_viol_tol": 1e-8, "max_wall_time": float(remaining), "bound_relax_factor": 1e-10,
             }
         }  # fmt: skip
 
