@@ -73,7 +73,8 @@ def test_derivatives_against_finite_differences():
     D, kinematics = model.steps(q, h, lam).D, model.kinematics(q)
     assert D is not None
     coupled, moved = model.structure()
-    assert np.all(coupled[:6]) and coupled[6:, 6:].sum() == 4 * 3 * 3
+    assert np.all(coupled[:6])
+    assert coupled[6:, 6:].sum() == 4 * 3 * 3
     assert not np.any(D[:, :, ~coupled])
     assert not np.any(kinematics.J[:, ~moved.repeat(3, axis=0).reshape(4, 3, nv)])
     for i in range(nv):

@@ -99,8 +99,8 @@ class WholeBodyModel:
         self.nj = robot.model.nv - 6
 
     def structure(self) -> tuple[Array, Array]:
-        """Where derivatives can differ from zero: of a joint's equation by a joint (nv, nv), only along one branch of the
-        tree, and of a point by a joint (C, nv)."""
+        """Where derivatives can differ from zero: of a joint's equation by a joint (nv, nv), only along one branch of
+        the tree, and of a point by a joint (C, nv)."""
         model, nv = self.model, self.model.nv
         joints = [1] * 6 + list(range(2, model.njoints))
         above = np.array([[j in model.supports[i] for j in joints] for i in joints])
