@@ -74,6 +74,6 @@ def _draw_joints(axis: Axes, reference: Reference, joints: JointMotion, robot: R
     axis.stairs(torque.max(axis=1), reference.t, color="0.2", lw=0.8, label="largest torque")
     axis.plot(reference.t, speed.max(axis=1), color=PLAN, lw=1, ls=":", label="largest speed")
     axis.axhline(1.0, color="0.4", lw=0.8, ls="--")
-    axis.set_ylim(0, max(1.2, 1.1 * float(max(torque.max(), speed.max()))))
+    axis.set_ylim(0, max(1.3, 1.15 * float(max(torque.max(), speed.max()))))
     axis.set_title("joint torque and speed over their limits", loc="left", fontsize=10)
-    axis.legend(loc="upper left", ncols=6, frameon=False, fontsize=8)
+    axis.legend(loc="upper left", ncols=3, frameon=False, fontsize=8)
