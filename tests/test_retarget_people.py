@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from slomo.errors import InvalidData, UsageError
 from slomo.motion import KeypointMotion
-from slomo.retarget import feet
+from slomo.retarget import feet, human
 from slomo.retarget.stage import Config, run
 from slomo.robot import load_robot
 from slomo.stage import Artifact, Inputs, Silent
@@ -137,6 +137,23 @@ def test_five_points_give_what_the_whole_skeleton_gives():
     for name in ("base", "left_toe", "right_heel", "left_hand"):
         assert np.linalg.norm(got[name] - whole[name], axis=1).mean() < 0.06
     assert any("upper body" in line for line in said)
+
+
+@pytest.mark.parametrize("case", ["stride cut short", "turning", "jumping jacks"])
+def test_five_points_show_the_heading(case):
+    source = person(speed=1.0, period=1.2, seconds=2.5 if case == "stride cut short" else 5.0)
+    if case == "jumping jacks":
+        source = person(speed=0.0, spread=0.8)
+    positions = source.positions.copy()
+    rate = 0.5 if case == "turning" else 0.0
+    if rate:
+        angle, y = rate * positions[..., 0], positions[..., 1]  # at 1 m/s
+        positions[..., 0], positions[..., 1] = (1 / rate - y) * np.sin(angle), 1 / rate - (1 / rate - y) * np.cos(angle)
+    rng = np.random.default_rng(0)
+    positions += 0.01 * rng.standard_normal(positions.shape)
+    trunk = human.trunk_of(only(replace(source, positions=positions), FIVE), dt=1 / 30)
+    error = trunk.heading - rate * source["pelvis"][:, 0]
+    assert np.degrees(np.abs(error).max()) < 8
 
 
 def test_toes_turned_out_turn_the_robots_feet():

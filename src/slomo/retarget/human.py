@@ -7,6 +7,7 @@ from slomo.errors import InvalidData
 from slomo.motion import KeypointMotion
 from slomo.retarget.subject import Hands, Subject
 from slomo.retarget.trunk import Pairs, Trunk, across, frame, middle, seen
+from slomo.rotation import rot_z
 from slomo.skeleton import load_skeleton
 
 Array = np.ndarray
@@ -17,6 +18,9 @@ _LOWER = (_HIPS, ("pelvis",))
 _UPPER = (_SHOULDERS, ("neck",), ("chest",), ("head",))
 PAIRS: Pairs = (_HIPS, _SHOULDERS)
 _TURN = 0.5  # s, standard deviation of the window in which swinging arms and legs show the heading
+_STILL = 0.15  # of the mean: a spread of left minus right that is noise rather than a swing
+# Squared cosine between the mean and the spread of left minus right: limbs swing up to the first, open from the second.
+_SWINGS, _OPENS = 0.5, 0.85
 _TURNED_OUT = 0.8  # rad, toes further from the heading than this are not seen right
 
 
@@ -50,23 +54,37 @@ def trunk_of(motion: KeypointMotion, *, dt: float | None = None) -> Trunk:
 def _left_of_swinging(d: Array, *, window: float) -> Array:
     """(T, 3) horizontal direction to the left from d (T, 3), right to left between limbs that swing fore and aft.
 
-    In each window d is a constant to the left and a swing ahead, so left is where d changes least for its mean: this is
-    Fisher's discriminant (C + e I)^-1 m of mean m and covariance C. The mean alone would need whole strides.
+    In each window d is a constant to the left and a swing ahead. Its mean has a part of the swing left, unless the
+    window holds whole strides; that part lies along the direction in which d varies most, and is taken out of the
+    mean. Where d varies along its mean instead, limbs open and close (jumping jacks), and the mean stays as it is.
+    The windows turn with the body: what was found is undone, and found again, which leaves less to find.
 
     Args:
         window: standard deviation, in frames.
     """
-    d = d[:, :2]
+    heading = np.zeros(len(d))
+    for _ in range(4):
+        left = _left_in_window((rot_z(-heading) @ d[..., None])[:, :2, 0], window)
+        heading = heading + np.unwrap(np.arctan2(-left[:, 0], left[:, 1]))
+    return np.stack([-np.sin(heading), np.cos(heading), np.zeros(len(d))], axis=1)
+
+
+def _left_in_window(d: Array, window: float) -> Array:
+    """(T, 2) unit vectors: the mean of d (T, 2) in a window without the part that swings."""
 
     def mean(x: Array) -> Array:
         flat = gaussian_filter1d(x.reshape(len(x), -1), window, axis=0, mode="constant")
         return (flat / gaussian_filter1d(np.ones(len(x)), window, mode="constant")[:, None]).reshape(x.shape)
 
     m = mean(d)
-    C = mean(d[:, :, None] * d[:, None]) - m[:, :, None] * m[:, None]
-    e = 0.01 * np.sum(m**2, axis=1) + 1e-6 * np.mean(np.sum(d**2, axis=1)) + 1e-300
-    left = np.linalg.solve(C + e[:, None, None] * np.eye(2), m[..., None])[..., 0]
-    return np.column_stack([left / np.maximum(np.linalg.norm(left, axis=1), 1e-300)[:, None], np.zeros(len(d))])
+    spread, axes = np.linalg.eigh(mean(d[:, :, None] * d[:, None]) - m[:, :, None] * m[:, None])
+    swing = axes[..., 1]
+    length = np.maximum(np.linalg.norm(m, axis=1), 1e-300)
+    along = np.sum(m * swing, axis=1) / length
+    lopsided = (spread[:, 1] - spread[:, 0]) / (spread.sum(axis=1) + (_STILL * length) ** 2)
+    part = lopsided * np.clip((_OPENS - along**2) / (_OPENS - _SWINGS), 0, 1)
+    left = m / length[:, None] - (part * along)[:, None] * swing
+    return left / np.maximum(np.linalg.norm(left, axis=1), 1e-300)[:, None]
 
 
 def read(motion: KeypointMotion) -> Subject:
