@@ -38,7 +38,7 @@ def test_mass_balance_and_inertia_are_the_robots(robot):
 @every_robot
 def test_legs_reach_the_nominal_pose_and_what_random_joints_reach(robot):
     model, data = PointFootModel.from_robot(robot), robot.model.createData()
-    nominal = np.linalg.norm(robot.nominal_feet - robot.nominal_hips, axis=1)
+    nominal = np.linalg.norm(robot.nominal_feet - model.leg_roots, axis=1)
     assert np.all((model.leg_min < nominal) & (nominal < model.leg_max))
     assert np.all(robot.nominal_feet[:, 2] <= -model.clearance)
     rng = np.random.default_rng(0)
@@ -53,6 +53,9 @@ def test_legs_reach_the_nominal_pose_and_what_random_joints_reach(robot):
         length = np.linalg.norm(feet - hips, axis=1)
         assert np.all(length >= robot.leg_reach[:, 0] - 1e-6)
         assert np.all(length[single] <= robot.leg_reach[single, 1] + 1e-6)
+        if robot.kind == "quadruped":  # one joint carries the hip: its axis bounds the foot exactly
+            root = np.linalg.norm(robot.frames_in_base(q, robot.foot_names) - model.leg_roots, axis=1)
+            assert np.all((root >= robot.root_reach[:, 0] - 1e-6) & (root <= robot.root_reach[:, 1] + 1e-6))
         np.testing.assert_allclose(
             np.linalg.norm(np.diff(feet[model.pairs], axis=1)[:, 0], axis=1), model.pair_length, atol=1e-9
         )

@@ -4,14 +4,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from slomo.robot_limbs import force_limits, reach, underside
+from slomo.robot_limbs import Point, force_limits, leg_root, reach, underside
 
 
 def chain(*lengths):
     """Revolute joints about y on a free-flyer, each a length (m) along x after the last; (model, joint ids)."""
     model = pin.Model()
     parent = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root")
-    model.addFrame(pin.Frame("hip", 1, 0, pin.SE3.Identity(), pin.FrameType.BODY))
     for i, offset in enumerate([0.0, *lengths[:-1]]):
         place = pin.SE3(np.eye(3), np.array([offset, 0, 0]))
         parent = model.addJoint(parent, pin.JointModelRY(), place, f"joint{i}")
@@ -29,7 +28,7 @@ def test_reach_of_two_links(knee, nearest, farthest):
     model, foot = chain(0.3, 0.2)
     limits = np.array([[-1.0, knee[0]], [1.0, knee[1]]])
     q = np.concatenate([pin.neutral(model)[:7], limits.mean(axis=0)])
-    got = reach(model, q, "hip", foot, np.array([0.2, 0, 0]), lower=limits[0], upper=limits[1])
+    got = reach(model, q, Point(1, np.zeros(3)), Point(foot, np.array([0.2, 0, 0])), lower=limits[0], upper=limits[1])
     np.testing.assert_allclose(got, [nearest, farthest], rtol=1e-6)
 
 
@@ -38,9 +37,32 @@ def test_reach_of_seven_links_is_their_length():
     model, hand = chain(*lengths)
     bounds = np.full(7, 2.5)
     q = np.concatenate([pin.neutral(model)[:7], np.full(7, 0.7)])
-    nearest, farthest = reach(model, q, "hip", hand, np.array([0.08, 0, 0]), lower=-bounds, upper=bounds)
+    root, tip = Point(1, np.zeros(3)), Point(hand, np.array([0.08, 0, 0]))
+    nearest, farthest = reach(model, q, root, tip, lower=-bounds, upper=bounds)
     assert farthest == pytest.approx(lengths.sum(), rel=1e-6)
     assert nearest < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("offset", "at"),
+    [
+        ([0.0, 0.08, 0.0], [0.2, 0.1, 0.05]),  # across the leg: its length does not depend on the first joint
+        ([0.05, 0.0, 0.0], [0.25, 0.1, 0.05]),  # along the first joint's axis: it moves no hip
+    ],
+)
+def test_leg_root(offset, at):
+    """A hip joint about x at (0.2, 0.1, 0.05) carries, at an offset, a thigh joint about y and a foot 0.4 m below."""
+    model = pin.Model()
+    trunk = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root")
+    first = model.addJoint(trunk, pin.JointModelRX(), pin.SE3(np.eye(3), np.array([0.2, 0.1, 0.05])), "hip")
+    thigh = model.addJoint(first, pin.JointModelRY(), pin.SE3(np.eye(3), np.array(offset)), "thigh")
+    model.addFrame(pin.Frame("thigh_link", thigh, 0, pin.SE3.Identity(), pin.FrameType.BODY))
+    model.addFrame(pin.Frame("foot", thigh, 0, pin.SE3(np.eye(3), np.array([0, 0, -0.4])), pin.FrameType.BODY))
+    q = pin.neutral(model)
+    q[:3] = 3.0, 2.0, 1.0
+    root = leg_root(model, q, "thigh_link", "foot", lower=np.full(2, -1.0), upper=np.full(2, 1.0))
+    assert root.joint == 1
+    np.testing.assert_allclose(root.at, at, atol=1e-12)
 
 
 def test_force_limits_of_one_leg():

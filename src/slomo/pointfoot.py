@@ -27,8 +27,8 @@ class PointFootModel:
     Attributes:
         mass: kg, of the body: the robot without its feet.
         inertia: (3, 3) kg m^2, of the body about its origin, body frame.
-        hips: (C, 3) m, attachment of each leg in the body frame.
-        leg_min, leg_max: (C,) m, limits of the distance from hip to foot.
+        hips: (C, 3) m, attachment of each leg in the body frame, where key points have it.
+        leg_min, leg_max: (C,) m, limits of the distance from `leg_roots` to foot.
         foot_mass: (C,) kg.
         u_max: (C, 3) N, largest |u| along each world axis.
         mu: friction coefficient.  g: m/s^2.
@@ -37,6 +37,7 @@ class PointFootModel:
         pair_length: (P,) m.
         clearance: (C,) m, least distance of a point below the body's origin along the body's z axis; -inf where
             the point is free (a hand).
+        leg_roots: (C, 3) m, body frame: where leg lengths are measured from; the hips unless given.
     """
 
     mass: float
@@ -52,11 +53,14 @@ class PointFootModel:
     pairs: Array = field(default_factory=lambda: np.zeros((0, 2), int))
     pair_length: Array = field(default_factory=lambda: np.zeros(0))
     clearance: Array = field(default_factory=lambda: np.array(-np.inf))  # one number counts for every point
+    leg_roots: Array = field(default_factory=lambda: np.zeros((0, 3)))  # none: the hips
 
     def __post_init__(self):
         C = len(self.names)
+        if np.size(self.leg_roots) == 0:
+            object.__setattr__(self, "leg_roots", self.hips)
         for name, shape in dict(
-            inertia=(3, 3), hips=(C, 3), leg_min=(C,), leg_max=(C,), foot_mass=(C,), u_max=(C, 3)
+            inertia=(3, 3), hips=(C, 3), leg_min=(C,), leg_max=(C,), foot_mass=(C,), u_max=(C, 3), leg_roots=(C, 3)
         ).items():
             x = np.asarray(getattr(self, name), float)
             if x.shape != shape or not np.all(np.isfinite(x)):
@@ -103,15 +107,15 @@ class PointFootModel:
     def from_robot(cls, robot: Robot, *, mu: float = 0.6) -> Self:
         """The model of a robot, all of it from its URDF (see `Robot`). `mu` is the friction coefficient to plan with.
 
-        Leg lengths are the joints' reach, tightened because near a straight or a folded leg the hip frame's own motion
-        counts. `u_max` is what the joint efforts allow along one axis at the nominal pose.
+        Leg lengths are the joints' reach, tightened to stay away from straight and folded legs. `u_max` is what the
+        joint efforts allow along one axis at the nominal pose.
         """
         return cls(
             mass=robot.body.mass,
             inertia=robot.body.inertia,
             hips=robot.nominal_hips,
-            leg_min=1.1 * robot.leg_reach[:, 0],
-            leg_max=0.97 * robot.leg_reach[:, 1],
+            leg_min=1.1 * robot.root_reach[:, 0],
+            leg_max=0.97 * robot.root_reach[:, 1],
             foot_mass=robot.foot_mass,
             u_max=robot.force_limits,
             names=robot.limb_names,
@@ -119,4 +123,5 @@ class PointFootModel:
             pairs=robot.pairs,
             pair_length=robot.pair_length,
             clearance=robot.clearance,
+            leg_roots=robot.leg_roots,
         )

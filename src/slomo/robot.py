@@ -15,7 +15,7 @@ import pinocchio as pin  # pyright: ignore[reportMissingImports]
 from slomo.errors import InvalidData
 from slomo.robot_body import point_foot_body, rigid_groups, swing_masses
 from slomo.robot_file import HUMANOID_LIMBS, find_robot_file, find_urdf, read_robot_file, robot_folders
-from slomo.robot_limbs import force_limits, reach, underside
+from slomo.robot_limbs import Point, force_limits, frame_point, leg_root, reach, underside
 from slomo.robot_model import (
     Limb,
     add_frame,
@@ -135,22 +135,27 @@ class Robot:
     def leg_reach(self) -> Array:
         """(C, 2) m, least and greatest distance of hip and foot frames within the joint limits.
 
-        The hip frame moves with the joints above it, so this is the length of the leg proper. The greatest distances r
-        of toe and heel are such that the point of the sole under the ankle, at most l from the hip, stays within reach
-        whenever both hold: r_i^2 = l^2 + s_i^2 for points at s_i from it, by Stewart's theorem.
+        The hip frame moves with the joints above it, so this is the length of the leg proper.
         """
-        out = np.empty((len(self.limbs), 2))
-        for c, limb in enumerate(self.limbs):
-            out[c] = self._reach(limb, *self._point(limb))
-        for pair in self.pairs:
-            limb = self.limbs[pair[0]]
-            joint, a = self._point(limb)
-            b = self._point(self.limbs[pair[1]])[1]
-            share = np.clip(-a @ (b - a) / ((b - a) @ (b - a)), 0, 1)
-            sole = a + share * (b - a)  # the joint's origin, which is the ankle, projected on the line from a to b
-            _, length = self._reach(limb, joint, sole)
-            out[pair, 1] = [np.hypot(length, np.linalg.norm(p - sole)) for p in (a, b)]
-        return out
+        return self._reach(self._hips)
+
+    @cached_property
+    def leg_roots(self) -> Array:
+        """(C, 3) m, base frame: points of the trunk from which `root_reach` bounds the feet (see `leg_root`).
+
+        The hip at the nominal pose, or the point nearest to it on the axis that swings it.
+        """
+        T_root_base = self.model.frames[self.model.getFrameId(self.base)].placement
+        return np.array([T_root_base.actInv(point.at) for point in self._roots])
+
+    @cached_property
+    def root_reach(self) -> Array:
+        """(C, 2) m, least and greatest distance of `leg_roots` and foot frames within the joint limits.
+
+        As `leg_reach` where the root is the hip; exact, whatever the first joint's angle, where it is on its axis.
+        """
+        on_axis = np.linalg.norm(self.leg_roots - self.nominal_hips, axis=1) > 1e-6
+        return self._reach([p if on else h for p, h, on in zip(self._roots, self._hips, on_axis, strict=True)])
 
     @cached_property
     def force_limits(self) -> Array:
@@ -203,13 +208,34 @@ class Robot:
         T_world_base = data.oMf[self.model.getFrameId(self.base)]
         return np.array([T_world_base.actInv(data.oMf[self.model.getFrameId(n)].translation) for n in names])
 
-    def _point(self, limb: Limb) -> tuple[int, Array]:
-        """Joint that moves the limb's point, and the point (3,) m in its frame."""
-        frame = self.model.frames[self.model.getFrameId(limb.foot)]
-        return frame.parentJoint, frame.placement.translation
+    @property
+    def _hips(self) -> list[Point]:
+        return [frame_point(self.model, limb.hip) for limb in self.limbs]
 
-    def _reach(self, limb: Limb, joint: int, point: Array) -> tuple[float, float]:
-        return reach(self.model, self.q_nominal, limb.hip, joint, point, lower=self.lower, upper=self.upper)
+    @cached_property
+    def _roots(self) -> list[Point]:
+        q, lower, upper = self.q_nominal, self.lower, self.upper
+        return [leg_root(self.model, q, limb.hip, limb.foot, lower=lower, upper=upper) for limb in self.limbs]
+
+    def _reach(self, starts: list[Point]) -> Array:
+        """(C, 2) m, least and greatest distance of C points from the foot frames.
+
+        The greatest distances r of toe and heel are such that the point of the sole under the ankle, at most l from the
+        start, stays within reach whenever both hold: r_i^2 = l^2 + s_i^2 for points at s_i from it (Stewart's theorem).
+        """
+
+        def distances(start: Point, end: Point) -> tuple[float, float]:
+            return reach(self.model, self.q_nominal, start, end, lower=self.lower, upper=self.upper)
+
+        feet = [frame_point(self.model, name) for name in self.foot_names]
+        out = np.array([distances(start, foot) for start, foot in zip(starts, feet, strict=True)])
+        for pair in self.pairs:
+            a, b = (feet[c].at for c in pair)
+            share = np.clip(-a @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+            sole = a + share * (b - a)  # the joint's origin, which is the ankle, projected on the line from a to b
+            _, length = distances(starts[pair[0]], Point(feet[pair[0]].joint, sole))
+            out[pair, 1] = [np.hypot(length, np.linalg.norm(p - sole)) for p in (a, b)]
+        return out
 
 
 def key_point_names(limbs: tuple[str, ...]) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 import itertools
 import xml.etree.ElementTree as ET
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,21 +15,67 @@ from slomo.robot_file import find_mesh
 
 Array = np.ndarray
 
-_STARTS = 12  # of the search, spread evenly over the joints' ranges; the nominal pose and the limits come first
+_SWING = 0.5  # rad
+_STARTS = 6  # of the search, spread evenly over the joints' ranges; the nominal pose and the limits come first
 
 
-def reach(
-    model: pin.Model, q: Array, hip: str, joint: int, point: Array, *, lower: Array, upper: Array
-) -> tuple[float, float]:
-    """Least and greatest distance (m) of a hip frame's origin from a point (3,) m in a joint's frame.
+@dataclass(frozen=True)
+class Point:
+    """A point of the robot: at `at` (3,) m in the frame of a joint (1 is the root)."""
 
-    The squared distance is minimised and maximised over the joints between them within lower and upper (nj,), by
-    L-BFGS-B with the exact gradient from the same starts every time, the other joints as in q (nq,).
+    joint: int
+    at: Array
+
+
+def frame_point(model: pin.Model, name: str) -> Point:
+    """The origin of a frame."""
+    frame = model.frames[model.getFrameId(name)]
+    return Point(frame.parentJoint, frame.placement.translation)
+
+
+def leg_root(model: pin.Model, q: Array, hip: str, foot: str, *, lower: Array, upper: Array) -> Point:
+    """The point of the root from which the leg's length depends least on the joints that swing its hip.
+
+    A quadruped's hip is carried about an axis of the trunk at a distance of several centimetres, across the leg. From
+    the axis's point nearest to it the hip, and with it the foot, is as far whatever that joint's angle. So, of this
+    point, if one joint alone moves the hip's origin, and of the hip as it is at q, the one from which the foot's
+    distance varies less while the joints down to the hip's turn by up to half a radian.
     """
     data = model.createData()
     frame = model.getFrameId(hip)
-    above = model.supports[model.frames[frame].parentJoint]
-    joints = [j for j in model.supports[joint] if j > 1 and j not in above]
+    pin.computeJointJacobians(model, data, q)
+    pin.updateFramePlacements(model, data)
+    J = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)[:, 6:]
+    origin = data.oMf[frame].translation.copy()
+    T_world_root = data.oMi[1].copy()
+    candidates = [origin]
+    movers = np.flatnonzero(np.linalg.norm(J[:3], axis=0) > 1e-3)
+    if len(movers) == 1 and model.parents[2 + int(movers[0])] == 1:
+        axis, motion = J[3:, movers[0]], J[:3, movers[0]]  # no axis: a sliding joint
+        candidates += [origin - np.cross(motion, axis)] if np.any(axis) else []
+
+    joints = [j for j in model.supports[model.frames[frame].parentJoint] if j > 1]
+    at = [model.idx_qs[j] for j in joints]
+    swing = 2 * qmc.Halton(max(len(joints), 1), scramble=False).random(64)[:, : len(joints)] - 1
+    lengths = np.empty((len(swing), len(candidates)))
+    posed = q.copy()
+    for k, turn in enumerate(swing):
+        posed[at] = np.clip(q[at] + _SWING * turn, lower[[a - 7 for a in at]], upper[[a - 7 for a in at]])
+        pin.framesForwardKinematics(model, data, posed)
+        lengths[k] = np.linalg.norm(data.oMf[model.getFrameId(foot)].translation - candidates, axis=1)
+    best = int(np.argmin(np.ptp(lengths, axis=0)))
+    return Point(1, T_world_root.actInv(candidates[best]))
+
+
+def reach(model: pin.Model, q: Array, start: Point, end: Point, *, lower: Array, upper: Array) -> tuple[float, float]:
+    """Least and greatest distance (m) of two points, `end` further down the same limb than `start`.
+
+    The squared distance is minimised and maximised over the joints between them within lower and upper (nj,), by a
+    truncated Newton method (Nash 1984) with the exact gradient from the same starts every time, the other joints as in
+    q (nq,).
+    """
+    data = model.createData()
+    joints = [j for j in model.supports[end.joint] if j > 1 and j not in model.supports[start.joint]]
     q = q.copy()
     at = [model.idx_qs[j] for j in joints]
     columns = [model.idx_vs[j] for j in joints]
@@ -37,11 +84,10 @@ def reach(
     def squared(angles: Array, sign: float) -> tuple[float, Array]:
         q[at] = angles
         pin.computeJointJacobians(model, data, q)
-        pin.updateFramePlacement(model, data, frame)
-        tip = data.oMi[joint].act(point)
-        line = tip - data.oMf[frame].translation
-        J = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)[:, columns]
-        arm = tip - data.oMi[joint].translation
+        tip = data.oMi[end.joint].act(end.at)
+        line = tip - data.oMi[start.joint].act(start.at)
+        J = pin.getJointJacobian(model, data, end.joint, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)[:, columns]
+        arm = tip - data.oMi[end.joint].translation
         return sign * line @ line, sign * 2 * (line @ J[:3] + np.cross(arm, line) @ J[3:])
 
     if not joints:
@@ -52,7 +98,7 @@ def reach(
     ends = []
     for sign in (1.0, -1.0):
         found = [
-            minimize(squared, x, (sign,), jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True))).fun
+            minimize(squared, x, (sign,), jac=True, method="TNC", bounds=list(zip(low, high, strict=True))).fun
             for x in starts
         ]
         ends.append(float(np.sqrt(max(sign * min(found), 0.0))))

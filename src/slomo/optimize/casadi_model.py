@@ -135,7 +135,7 @@ def limits(model: PointFootModel, x: ca.SX, quat_ref: ca.SX) -> tuple[ca.SX, Arr
     R = matrix(multiply(quat_ref, exponential(s.d)))
     rows, low, high = [], [], []
     for c in range(model.C):
-        leg = s.p + ca.mtimes(R, ca.DM(model.hips[c])) - s.f[:, c]
+        leg = s.p + ca.mtimes(R, ca.DM(model.leg_roots[c])) - s.f[:, c]
         rows.append(ca.dot(leg, leg))
         low.append(model.leg_min[c] ** 2)
         high.append(model.leg_max[c] ** 2)

@@ -41,7 +41,7 @@ class Body(NamedTuple):
             float(model.mass),
             model.inertia,
             np.ascontiguousarray(np.linalg.inv(model.inertia)),
-            model.hips,
+            model.leg_roots,
             model.leg_min,
             model.leg_max,
             model.foot_mass,

@@ -63,7 +63,7 @@ def verify(
     r, names = reference, model.names
     parts = ("body position", "body rotation", "body velocity", *names, "time")
     R = Rotation.from_quat(r.q[:, 3:7])
-    hips = r.q[:, None, :3] + np.stack([R.apply(h) for h in model.hips], axis=1)
+    hips = r.q[:, None, :3] + np.stack([R.apply(h) for h in model.leg_roots], axis=1)
     leg = np.linalg.norm(hips - r.points, axis=2)
     ratio = np.abs(r.u.reshape(-1, model.C, 3)) / model.u_max
     checks = {"dynamics_residual": worst(dynamics_defect(model, r), 1e-6, "", r.t[1:], parts)}
