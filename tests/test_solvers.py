@@ -9,6 +9,8 @@ from gaits import gait, humanoid, on, quadruped, reference
 from slomo.errors import UsageError
 from slomo.optimize import problem
 from slomo.optimize.casadi_nlp import OptimalControl
+from slomo.optimize.closing import end_gap
+from slomo.optimize.cycle import close, end_shift
 from slomo.optimize.fatrop import SmoothForm, solve_fatrop
 from slomo.optimize.ipopt import solve_ipopt
 from slomo.optimize.solve import Settings, solve
@@ -134,13 +136,33 @@ def test_step_lengths_as_unknowns():
     assert other.cost == pytest.approx(solve(model, task, start, terrain=FLAT).cost, rel=1e-2)
 
 
-def test_what_only_the_compiled_solver_does_is_refused():
+def test_points_that_may_not_slide_are_refused():
     model = quadruped()
     task, start = make(model, 0.2)
-    with pytest.raises(UsageError, match="does not close cycles"):
-        solve_fatrop(model, task._replace(cyclic=True), start, terrain=FLAT)
-    with pytest.raises(UsageError, match="strictly"):
+    with pytest.raises(UsageError, match="strict"):
         solve_fatrop(model, task, start, terrain=FLAT, settings=Settings(strict=True))
+    with pytest.raises(UsageError, match="strict"):
+        solve_ipopt(model, task._replace(stick=~task.stick), start, terrain=FLAT)
+
+
+@pytest.mark.slow
+def test_a_cycle_closes():
+    """One stride of a turning trot, end and start the same but for the way that it went; two solvers, one optimum."""
+    model = quadruped()
+    want = close(gait(model, 0.4, turn=0.5), 0, 8)
+    task = problem.make_task(model, want, FLAT, problem.Weights())
+    task, start = task._replace(cyclic=True, shift=end_shift(want)), problem.make_start(model, want, task)
+    costs = []
+    for solver in (solve_fatrop, solve_ipopt):
+        other = solver(model, task, start, terrain=FLAT, settings=SETTINGS)
+        assert other.status == "converged"
+        e, it = np.zeros(36), other.iterate
+        end_gap(task, it.qs[0], it.vs[0], it.qs[-1], it.vs[-1], e)
+        assert np.abs(e).max() < 1e-6
+        checks = verify(model, reference(model, task, other), terrain=FLAT)
+        assert [n for n, c in checks.items() if not c.holds] == []
+        costs.append(other.cost)
+    assert costs[0] == pytest.approx(costs[1], rel=1e-2)
 
 
 def test_a_solver_out_of_iterations_says_so_and_keeps_its_iterate():

@@ -73,11 +73,10 @@ def run(
         point is the plane that it was solved with; otherwise it says what went wrong.
 
     Raises:
-        UsageError: what only the compiled solver does: a cyclic motion, points that may not slide.
+        UsageError: points that may not slide, which only the compiled solver does.
     """
-    if task.cyclic or settings.strict or np.any(task.stick):
-        what = "close cycles" if task.cyclic else "hold points strictly"
-        raise UsageError(f"{plugin.title} does not {what}", where="optimize.solver", todo="use the solver ddp")
+    if settings.strict or np.any(task.stick):
+        raise UsageError(f"{plugin.title} has no strict contact", where="optimize.solver", todo="use the solver ddp")
     began = time.perf_counter()
     control = OptimalControl(*form.knots, N=len(start.us), plugin=plugin.name)
     compile_seconds, began = time.perf_counter() - began, time.perf_counter()

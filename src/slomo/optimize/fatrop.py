@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 
 from slomo.optimize import casadi_model as cm
+from slomo.optimize.casadi_cycle import CyclicForm
 from slomo.optimize.casadi_nlp import Knot
 from slomo.optimize.casadi_solve import SECONDS, Plugin, run
 from slomo.optimize.cost import Task
@@ -99,7 +100,7 @@ def solve_fatrop(
     The cost is the task's alone, without penalties. Dynamics hold to 1e-8, not to rounding.
 
     Raises:
-        UsageError: a cyclic task.
+        UsageError: points that may not slide.
     """
     s = settings or Settings()
 
@@ -109,4 +110,6 @@ def solve_fatrop(
         return {"fatrop": own}
 
     plugin = Plugin("fatrop", "Fatrop", options, seconds)
-    return run(SmoothForm(model, task), plugin, task, start, terrain=terrain, settings=s, report=report)
+    form = SmoothForm(model, task)
+    form = CyclicForm(form, task) if task.cyclic else form
+    return run(form, plugin, task, start, terrain=terrain, settings=s, report=report)

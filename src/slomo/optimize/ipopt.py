@@ -18,6 +18,7 @@ import casadi as ca
 import numpy as np
 
 from slomo.optimize import casadi_model as cm
+from slomo.optimize.casadi_cycle import CyclicForm
 from slomo.optimize.casadi_nlp import Fields, Knot
 from slomo.optimize.casadi_solve import SECONDS, Plugin, run
 from slomo.optimize.contact import tangents
@@ -141,7 +142,7 @@ def solve_ipopt(
     that did not converge satisfies nothing in particular.
 
     Raises:
-        UsageError: a cyclic task, or points that may not slide.
+        UsageError: points that may not slide.
     """
     s = settings or Settings()
 
@@ -154,4 +155,6 @@ def solve_ipopt(
         }  # fmt: skip
 
     plugin = Plugin("ipopt", "IPOPT", options, seconds)
-    return run(ComplementarityForm(model, task), plugin, task, start, terrain=terrain, settings=s, report=report)
+    form = ComplementarityForm(model, task)
+    form = CyclicForm(form, task) if task.cyclic else form
+    return run(form, plugin, task, start, terrain=terrain, settings=s, report=report)
