@@ -185,8 +185,9 @@ def test_missing_hand_hangs_and_missing_foot_stays_under_its_hip():
     assert report["unseen_limbs"] == ["right"]
     assert report["unseen_hands"] == ["left"]
     assert {"never seen, so kept under the hip: right", "never seen, so hanging: left hand"} <= set(said)
-    assert np.all(motion.confidence[:, motion.index("right_toe")] == 0)
-    assert np.all(motion.confidence[:, motion.index("left_hand")] == 0)
+    assert np.all(motion.confidence[:, motion.index("right_toe")] == 0.1)
+    assert np.all(motion.confidence[:, motion.index("left_hand")] == 0.1)
+    assert np.all(motion.confidence[:, motion.index("left_toe")] == 1)
     middle = (motion["right_toe"] + motion["right_heel"]) / 2 - motion["right_toe_hip"]
     assert np.abs(middle[:, :2]).max() < 0.05
     assert np.linalg.norm(motion["left_hand"] - motion["left_hand_hip"], axis=1).max() < G1.leg_reach[4, 1]

@@ -57,7 +57,7 @@ def human(seed: int) -> Ugly:
     kind = str(rng.choice(["walk", "stand", "bend", "jump", "jack", "paper"], p=[0.35, 0.1, 0.15, 0.1, 0.2, 0.1]))
     motion = _published(("human_jumping_jack",), rng) if kind == "paper" else None
     if motion is None:
-        seconds, period = rng.uniform(2.0, 6.0), rng.uniform(0.9, 1.5)
+        seconds, period = rng.uniform(2.0, 6.0), rng.uniform(0.9, 1.5) * (1.0 + (kind == "jack"))
         frames = len(np.arange(0, seconds, 1 / 30))
         bow = rng.uniform(0.5, 1.1) * (0.5 - 0.5 * np.cos(2 * np.pi * np.arange(frames) / frames))
         motion = person(

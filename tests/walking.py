@@ -76,8 +76,9 @@ def person(
     air = np.sqrt(8 * jump / 9.81)
     since = t % period
     hop = np.where(since < air, 9.81 / 2 * since * (air - since), 0.0)
-    # Jumping jacks: 0.3 s in the air to open, and half a period later to close.
-    opening = np.clip(since / 0.3, 0, 1) - np.clip((since - period / 2) / 0.3, 0, 1)
+    # Jumping jacks: 0.3 s in the air to open, and half a period later to close; the arms take their time.
+    opening, arms = (np.clip(since / s, 0, 1) - np.clip((since - period / 2) / s, 0, 1) for s in (0.3, 0.45 * period))
+    arms = arms**2 * (3 - 2 * arms) * (spread > 0)
     opening = spread * opening**2 * (3 - 2 * opening)
     if spread:
         half = since % (period / 2)
@@ -102,7 +103,7 @@ def person(
         out[f"{side}_toe"] = ankle + [0.085 * h, 0, -0.027 * h]
         shoulder = pelvis + h * 0.305 * up + [0, 0.095 * h * y, 0]
         swing = 0.4 * (speed > 0) * np.sin(2 * np.pi * (t / period - phase))
-        out_of = np.pi * opening / max(spread, 1e-9) * 0.8
+        out_of = 0.8 * np.pi * arms
         hand = np.stack([np.sin(swing) * np.cos(out_of), y * np.sin(out_of), -np.cos(swing) * np.cos(out_of)], axis=1)
         out[f"{side}_shoulder"], out[f"{side}_wrist"] = shoulder, shoulder + 0.30 * h * hand
         out[f"{side}_elbow"] = _bend(shoulder, out[f"{side}_wrist"], (0.165 * h, 0.15 * h), np.array([[-1.0, 0, 0]]))

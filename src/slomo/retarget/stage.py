@@ -21,6 +21,7 @@ from slomo.robot import Robot
 from slomo.stage import Artifact, Inputs, Progress
 
 VERSION = 5
+_BRIDGED, _PLACED = 0.2, 0.1  # confidence of key points in a gap, and of a humanoid's that were never seen
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     middle = np.column_stack([paths.body, z])
     base = middle - R.apply(body.root)
     roots = np.stack([base + R.apply(r) for r in body.roots], axis=1)
-    # A leg that was never seen stays under its hip, and says so by confidence 0.
+    # A leg that was never seen stays under its hip.
     unseen = ~walk.known
     offset = np.einsum(
         "tij,sj->tsi", R.as_matrix(), np.column_stack([body.home - body.roots[:, :2], 0 * body.home[:, 0]])
@@ -109,6 +110,10 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
             subject.hands, base, R, robot, body
         )
         _report_hands(subject, body, robot, report, progress)
+    # A bridge over a gap is worth something. So is where an unseen foot or hand was put: without it, nothing would keep
+    # a toe before its heel. An unseen paw is free.
+    seen = np.any(confidence > 0, axis=0)
+    confidence = np.where(seen, np.maximum(confidence, _BRIDGED), _PLACED if body.length else 0.0)
     names = ("base", *(f"{n}_hip" for n in robot.limb_names), *robot.key_points)
     result = KeypointMotion(
         t=motion.t - motion.t[0],
