@@ -300,6 +300,32 @@ def test_constraints_and_their_derivatives():
             assert np.allclose(row, expected[n], atol=1e-7)
 
 
+def test_curvature_of_links():
+    """Against second differences; of the rotation only what turns with the link is in it."""
+    rng = np.random.default_rng(0)
+    body = Body.of(make_model(6, pairs=[[0, 1], [3, 2]], pair_length=[0.2, 0.3]))
+    q, _, _ = random_state(rng, 6)
+    R = Rotation.from_quat(q[3:7]).as_matrix()
+    for n in (7, 18, 19):
+        H = np.zeros((48, 48))
+        constraints.add_curvature(body, q, R, n, 2.0, H)
+
+        def force(d, n=n):
+            qa, va, grad, index, row = np.zeros(25), np.zeros(24), np.zeros(9), np.zeros(9, int), np.zeros(24)
+            dynamics.plus(q, np.zeros(24), np.append(d, np.zeros(24)), 1.0, qa, va)
+            Ra = Rotation.from_quat(qa[3:7]).as_matrix()
+            count = constraints.gradient(body, qa, Ra, n, index, grad)
+            row[index[:count]] = 2.0 * grad[:count]
+            return row
+
+        off = H[:24, :24] - numerical(force, np.zeros(24))
+        off[3:6, 3:6] = 0.0
+        assert np.abs(off).max() < 1e-6
+        assert np.linalg.eigvalsh(H)[0] > -1e-9
+        constraints.add_curvature(body, q, R, n, -4.0, H)
+        assert np.linalg.eigvalsh(H)[0] > -1e-9
+
+
 def test_cyclic_end_and_its_derivatives():
     rng = np.random.default_rng(10)
     task = make_task(rng, 4)._replace(cyclic=True, shift=np.array([0.3, -0.2, 0.1, 0.8]))

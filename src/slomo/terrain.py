@@ -63,7 +63,8 @@ class HeightField:
             grid = np.zeros(0)
         if grid.ndim != 2 or min(grid.shape) < 2 or not np.all(np.isfinite(grid)) or not self.spacing > 0:
             raise InvalidData("needs spacing > 0 and at least 2 x 2 finite heights", where="terrain field")
-        object.__setattr__(self, "z", tuple(tuple(row) for row in grid.tolist()))
+        rows: list[list[float]] = grid.tolist()  # pyright: ignore[reportAssignmentType]
+        object.__setattr__(self, "z", tuple(tuple(row) for row in rows))
 
     def sample(self, xy: Array) -> tuple[Array, Array, Array]:
         """Height (...), its gradient (..., 2) and whether the field covers the points (..., 2 or more)."""

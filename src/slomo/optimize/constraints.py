@@ -118,3 +118,45 @@ def gradient(body, q, R, n, index, grad):
     grad[0], grad[1] = sign, -sign
     index[0], index[1] = a + 2, b + 2
     return 2
+
+
+@compiled
+def add_curvature(body, q, R, n, force, H):
+    """Adds force * (second derivative of g_n) to H (nx, nx) where it is positive semidefinite: longest legs and pairs.
+
+    |d| curves with (1 - d d^T / |d|^2) / |d|: a force along a link holds it sideways too. Without this the Gauss-Newton
+    step overshoots several times. The second derivative of the rotation itself is left out.
+    """
+    C, P = body.hips.shape[0], body.pairs.shape[0]
+    d, J, index = np.empty(3), np.zeros((3, 9)), np.empty(9, np.int64)
+    if C <= n < 2 * C:
+        c, count = n - C, 9
+        length = _leg(body, q, R, c, d)
+        hip = body.hips[c]
+        for i in range(3):
+            J[i, i], J[i, 6 + i] = 1.0, -1.0
+            # d(R exp(w) hip) = -R [hip] w.
+            J[i, 3] = R[i, 2] * hip[1] - R[i, 1] * hip[2]
+            J[i, 4] = R[i, 0] * hip[2] - R[i, 2] * hip[0]
+            J[i, 5] = R[i, 1] * hip[0] - R[i, 0] * hip[1]
+            index[i], index[3 + i], index[6 + i] = i, 3 + i, 6 + 3 * c + i
+    elif 3 * C <= n < 3 * C + P:
+        p, count = n - 3 * C, 6
+        length = _apart(body, q, p, d)
+        for i in range(3):
+            J[i, i], J[i, 3 + i] = 1.0, -1.0
+            index[i], index[3 + i] = 6 + 3 * body.pairs[p, 0] + i, 6 + 3 * body.pairs[p, 1] + i
+    else:
+        return
+    if not force > 0.0:
+        return
+    along = np.zeros(9)
+    for a in range(count):
+        for i in range(3):
+            along[a] += d[i] * J[i, a] / length
+    for a in range(count):
+        for b in range(count):
+            s = -along[a] * along[b]
+            for i in range(3):
+                s += J[i, a] * J[i, b]
+            H[index[a], index[b]] += force / length * s

@@ -123,6 +123,7 @@ def state_derivative(body, task, k, q, v, multiplier, rho, Lx, Lxx):
             Lx[index[i]] += force * grad[i]
             for j in range(count):
                 Lxx[index[i], index[j]] += rho * grad[i] * grad[j]
+        constraints.add_curvature(body, q, R, n, force, Lxx)
 
 
 @compiled

@@ -66,9 +66,7 @@ def forward(task, it, w):
             if task.cyclic:
                 for j in range(nx):
                     s += w.Kt[k, i, j] * w.dx[0, j]
-            s = min(max(s, task.u_low[k, i] - it.us[k, i]), task.u_high[k, i] - it.us[k, i])
             w.du[k, i] = s
-            slope += w.Lu[k, i] * s
         for i in range(nx):
             s = w.gap[k, i]
             for j in range(nx):
@@ -76,6 +74,10 @@ def forward(task, it, w):
             for j in range(nu):
                 s += w.B[k, i, j] * w.du[k, j]
             w.dx[k + 1, i] = s
+        for i in range(nu):
+            s = min(max(w.du[k, i], task.u_low[k, i] - it.us[k, i]), task.u_high[k, i] - it.us[k, i])
+            w.du[k, i] = s
+            slope += w.Lu[k, i] * s
     for k in range(N + 1):
         for i in range(nx):
             slope += w.Lx[k, i] * w.dx[k, i]
@@ -86,7 +88,7 @@ def forward(task, it, w):
 
 
 @compiled
-def solve(body, task, kappa, it, rho, free_start, max_iterations, tolerance, reg, w):
+def solve(body, task, kappa, it, rho, free_start, max_iterations, tolerance, closed, reg, w):
     """Improves an iterate in place, for one kappa and one set of multipliers.
 
     Args:
@@ -94,6 +96,7 @@ def solve(body, task, kappa, it, rho, free_start, max_iterations, tolerance, reg
         kappa: N m.  it: start, and result.  rho: penalty of the constraints.
         free_start: whether the first state is unknown too.
         max_iterations, tolerance: of the decrease still expected, relative to the cost.
+        closed: l1 norm of the gaps that counts as none.
         reg: Levenberg-Marquardt factor to start with.
         w: scratch; its gains K and gaps belong to the result.
 
@@ -119,7 +122,7 @@ def solve(body, task, kappa, it, rho, free_start, max_iterations, tolerance, reg
                 if G > 1e-12:
                     nu = max(nu, 2.0 * max(slope, 0.0) / G)
                 descent = slope - nu * G
-                if descent > -tolerance * (1.0 + J) and G < 1e-7:
+                if descent > -tolerance * (1.0 + J) and closed > G:
                     return CONVERGED, iteration, J, G, reg
                 alpha = 1.0
                 for _ in range(8):

@@ -30,6 +30,31 @@ def transpose_times(A, V, out):
 
 
 @compiled
+def symmetric_times(A, VA, out):
+    """Lower triangle of out = A^T VA where that is symmetric, skipping zeros of A: A and VA (n, m), out (m, m)."""
+    n, m = A.shape
+    for i in range(m):
+        for j in range(i + 1):
+            out[i, j] = 0.0
+    for k in range(n):
+        for i in range(m):
+            a = A[k, i]
+            if a != 0.0:
+                for j in range(i + 1):
+                    out[i, j] += a * VA[k, j]
+
+
+@compiled
+def subtract_square(S, n, out):
+    """Lower triangle of out (m, m) -= S^T S with the first n rows of S (., m)."""
+    for k in range(n):
+        for i in range(out.shape[0]):
+            s = S[k, i]
+            for j in range(i + 1):
+                out[i, j] -= s * S[k, j]
+
+
+@compiled
 def cholesky(H, index, n, L):
     """L (lower, n x n) of H restricted to index[:n]. False when it is not positive definite."""
     for i in range(n):

@@ -6,7 +6,15 @@ import numpy as np
 
 from slomo.optimize.closing import end_derivative, end_gap
 from slomo.optimize.cost import input_derivative, state_derivative
-from slomo.optimize.dense import box_qp, copy, solve_lower, solve_upper, transpose_times
+from slomo.optimize.dense import (
+    box_qp,
+    copy,
+    solve_lower,
+    solve_upper,
+    subtract_square,
+    symmetric_times,
+    transpose_times,
+)
 from slomo.optimize.dynamics import linearize
 from slomo.optimize.jit import compiled
 
@@ -65,7 +73,7 @@ def backward(body, task, kappa, it, rho, reg, free_start, w):
                     VA[j, i] = AtV[i, j]
                 for j in range(nu):
                     VB[i, j] = BtV[j, i]
-            transpose_times(A, VA, Qxx)
+            symmetric_times(A, VA, Qxx)
             transpose_times(B, VA, Qux)
             transpose_times(B, VB, Quu)
             for i in range(nu):
@@ -92,14 +100,15 @@ def backward(body, task, kappa, it, rho, reg, free_start, w):
                     S[i, j] = Qux[index[i], j]
             solve_lower(L, n, S)
             for i in range(nx):
-                s = Lx[i]
-                for j in range(nx):
-                    s += A[j, i] * Vx[j]
-                for j in range(nu):
-                    s += Qux[j, i] * w.k[k, j]
-                scratch[i, 0] = s
+                lower[i] = Lx[i]
+            for j in range(nx):
+                for i in range(nx):
+                    lower[i] += A[j, i] * Vx[j]
+            for j in range(nu):
+                for i in range(nx):
+                    lower[i] += Qux[j, i] * w.k[k, j]
             for i in range(nx):
-                Vx[i] = scratch[i, 0]
+                Vx[i] = lower[i]
             copy(Qxx, Vxx)
             if task.cyclic:
                 transpose_times(A, Vxt, Qxt)
@@ -123,11 +132,7 @@ def backward(body, task, kappa, it, rho, reg, free_start, w):
                 for i in range(n):
                     for j in range(nt):
                         w.Kt[k, index[i], j] = -St[i, j]
-            for m in range(n):
-                for i in range(nx):
-                    s = S[m, i]
-                    for j in range(nx):
-                        Vxx[i, j] -= s * S[m, j]
+            subtract_square(S, n, Vxx)
             solve_upper(L, n, S)
             for i in range(n):
                 for j in range(nx):
@@ -135,7 +140,7 @@ def backward(body, task, kappa, it, rho, reg, free_start, w):
         for i in range(nx):
             Vxx[i, i] += reg * (_PROX_Q if i < nv else _PROX_V)
             for j in range(i):
-                Vxx[i, j] = Vxx[j, i] = 0.5 * (Vxx[i, j] + Vxx[j, i])
+                Vxx[j, i] = Vxx[i, j]
     if free_start:
         for i in range(nt):
             Vx[i] += Vt[i]

@@ -254,7 +254,7 @@ class Mpc:
         it.qs[0], it.vs[0] = q, v
         task.ground[:] = self.terrain.planes(it.qs[:, 7:].reshape(H + 1, C, 3))
         status, _, _, defect, _ = ddp.solve(
-            self._body, task, c.kappa, it, _PENALTY, False, c.iterations, c.tolerance, _REG, self._work
+            self._body, task, c.kappa, it, _PENALTY, False, c.iterations, c.tolerance, 1e-7, _REG, self._work
         )
         failed = status == ddp.NOT_FINITE or (status == ddp.STUCK and not defect < _DEFECT)
         if failed and last is not None:
