@@ -178,3 +178,19 @@ def test_a_standing_humanoid_needs_no_help_at_its_root():
     assert np.allclose(found.q[:, 7:], robot.q_nominal[7:], atol=1e-9)
     assert np.allclose(found.root_wrench, 0, atol=1e-6)
     assert np.all(np.abs(found.tau) < robot.effort)
+
+
+@pytest.mark.parametrize(("name", "share"), [("go1", 0.6), ("talos", 0.2), ("atlas", 0.2)])
+def test_what_joints_can_reach_is_reached(name, share):
+    """Poses drawn at random, `share` of the way from the nominal joints to any within their limits."""
+    robot, rng = load_robot(name), np.random.default_rng(0)
+    C = len(robot.limbs)
+    for _ in range(10):
+        q = robot.q_nominal.copy()
+        q[7:] += share * (rng.uniform(robot.lower, robot.upper) - q[7:])
+        x, _ = seen_from_outside(robot, q, np.zeros(robot.model.nv))
+        r = Reference(
+            t=np.array([0, 1.0]), h=np.ones(1), q=np.stack([x, x]), v=np.zeros((2, 6 + 3 * C)),
+            u=np.zeros((1, 3 * C)), lam=np.zeros((1, C, 3)), point_names=robot.foot_names, robot_digest="",
+        )  # fmt: skip
+        assert joint_motion(robot, r).miss.max() < 1e-4

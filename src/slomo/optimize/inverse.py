@@ -28,12 +28,13 @@ Array = np.ndarray
 
 WORLD = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 SINGULAR = 1e-8  # (m/rad)^2, damping that is always there: a straight leg moves no foot along itself
-FLAT = 0.02  # m/rad, of a foot's tilt about the line from heel to toe: gives way to the points
+FLAT = 0.01  # m/rad, of a foot's tilt about the line from heel to toe: gives way to the points
 LARGEST_STEP = 0.5  # rad
-STILL = 1e-6  # rad, step at which the iteration ends
-ITERATIONS = 40
+STILL = 1e-4  # rad, a step after which the iteration ends
+ITERATIONS = 30
+PULL = np.minimum(1.0, 0.7 ** (np.arange(ITERATIONS) - 8))  # home gives way at last: with limits it can go in circles
 RETURN = 0.5  # s in which redundant joints come back to their nominal angles
-SMOOTHING = 0.2  # s, of the redundant joints' home in the second pass
+SMOOTHING = 0.3  # s, of the redundant joints' home in the second pass
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class _Legs:
             across = np.cross([0.0, 0.0, 1.0], along)
             self._flat.append((joint, self.data.oMi[joint].rotation.T @ across / np.linalg.norm(across)))
         inertia = np.diag(pin.crba(self.model, self.data, robot.q_nominal))[6:]
-        self._scale = np.maximum(1.0, np.sqrt(inertia / np.median(inertia)))
+        self._scale = np.maximum(1.0, inertia / np.median(inertia))
         self.error = np.zeros(3 * len(self.points) + len(self._flat))
 
     def root(self, q: Array, v: Array) -> Array:
@@ -169,15 +170,15 @@ class _Legs:
         """(nj,) rad that bring the contact frames to points (C, 3), from a first guess, with the root at (7,)."""
         lower, upper, scale = self.robot.lower, self.robot.upper, self._scale
         q = np.concatenate([root, joints])
-        for _ in range(ITERATIONS):
+        for i in range(ITERATIONS):
             J = self.jacobian(q)[:, 6:] / scale
             e = self._residual(points)
-            away = (scale * (x - q[7:]) for x in (home, lower, upper))
-            step = _bounded_step(J, e, *away) / scale
+            to_home, to_lower, to_upper = (scale * (x - q[7:]) for x in (home, lower, upper))
+            step = _bounded_step(J, e, PULL[i] * to_home, to_lower, to_upper) / scale
             size = np.abs(step).max()
+            q[7:] = np.clip(q[7:] + step * min(1.0, LARGEST_STEP / max(size, STILL)), lower, upper)
             if size < STILL:
                 break
-            q[7:] = np.clip(q[7:] + step * min(1.0, LARGEST_STEP / size), lower, upper)
         pin.framesForwardKinematics(self.model, self.data, q)
         self.error = self._residual(points)
         return q[7:]
@@ -198,7 +199,7 @@ def _damped(J: Array, e: Array, damping: float) -> Array:
 
 
 def _bounded_step(J: Array, e: Array, home: Array, lower: Array, upper: Array) -> Array:
-    """dq with J dq = e, damped, and otherwise towards `home`; joints that would leave their bounds stop there."""
+    """dq with J dq = e, damped, and else towards `home`; joints that would leave their bounds stop there."""
     damping = SINGULAR + 0.5 * float(e @ e)
     step = np.zeros(len(home))
     free = np.ones(len(home), bool)
