@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from bench_optimize import PROBLEMS, SHARED, check
 from gaits import gait, humanoid, on, quadruped, reference
 from slomo.errors import UsageError
 from slomo.optimize import problem
@@ -87,7 +88,7 @@ def test_fatrop_finds_what_the_compiled_solver_finds(model, terrain, motion):
     assert [n for n, c in checks.items() if not c.holds] == []
 
 
-@pytest.mark.parametrize("slope", [0.0, 0.1])
+@pytest.mark.parametrize("slope", [0.0, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_the_published_form_verifies(slope):
     """Hard complementarity and Coulomb's pyramid: about the motion that the smooth contact gives."""
     terrain = Terrain(slopes=(Slope(-9, 9, -9, 9, -9 * slope, slope),))
@@ -181,3 +182,22 @@ def test_a_solver_out_of_time_says_so_and_keeps_its_iterate():
     assert other.status == "time limit"
     assert np.all(np.isfinite(other.iterate.qs))
     assert np.ptp(other.iterate.lam) > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cat00", "dog_cpr"])
+def test_what_the_compiled_solver_finds_of_published_motions_is_an_optimum(name):
+    """An interior-point method with exact Hessians, started there, ends where it began."""
+    if not (SHARED / f"{name}.json").exists():
+        pytest.skip(f"{SHARED / name}.json is not there")
+    p = PROBLEMS[name]()
+    task = problem.make_task(p.model, p.want, p.terrain, problem.Weights())
+    start = problem.make_start(p.model, p.want, task)
+    ours = solve(p.model, task, start, terrain=p.terrain, settings=SETTINGS)
+    assert ours.status == "converged"
+    other = check(p.model, task, ours.iterate, terrain=p.terrain, settings=SETTINGS)
+    assert other.status == "converged"
+    assert other.cost == pytest.approx(ours.cost, rel=1e-2)
+    moved, turned = apart(ours.iterate, other.iterate)
+    assert moved < 1e-2
+    assert turned < 2e-2

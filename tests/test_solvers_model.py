@@ -25,6 +25,7 @@ def make_model(C: int) -> PointFootModel:
         hips=PELVIS if human else HIPS, leg_min=np.full(C, 0.10), leg_max=np.full(C, 0.8 if human else 0.385),
         foot_mass=np.linspace(0.3, 0.6, C), u_max=np.full((C, 3), 400.0), names=tuple(f"leg{c}" for c in range(C)),
         pairs=[[0, 1], [2, 3]] if human else np.zeros((0, 2), int), pair_length=[0.2, 0.21] if human else np.zeros(0),
+        leg_roots=(PELVIS if human else HIPS) + [0.02, 0.01, -0.03],
         clearance=[0.2, 0.2, 0.2, 0.2, -np.inf, -np.inf] if human else np.full(C, 0.05),
     )  # fmt: skip
 
