@@ -210,6 +210,10 @@ def test_people_and_animals_need_their_own_robots():
     source = Artifact(npz={"keypoints.npz": person().to_arrays()})
     with pytest.raises(InvalidData, match="a person's motion needs a humanoid robot"):
         run(Inputs(artifacts={"import": source}, robot=go1), Config(), Silent())
+    source = person()
+    exchanged = tuple(n.replace("left", "x").replace("right", "left").replace("x", "right") for n in source.names)
+    with pytest.raises(InvalidData, match="toes point backwards"):
+        retarget(replace(source, names=exchanged))
     with pytest.raises(InvalidData, match="no key point marks the hips"):
         retarget(only(person(), FIVE[1:]))
     with pytest.raises(InvalidData, match="no foot has any confidence"):

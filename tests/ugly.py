@@ -194,11 +194,11 @@ def _only(motion: KeypointMotion, names: tuple[str, ...]) -> KeypointMotion:
 
 
 def _turned(motion: KeypointMotion, rate: float) -> KeypointMotion:
-    """A straight path bent into a circle, turning at `rate` rad/s: feet that stand go on standing."""
+    """A straight path bent into a circle, turning at `rate` rad/s or less: feet that stand go on standing."""
     if rate == 0:
         return motion
-    reach = max(float(np.ptp(motion.positions[..., 0])) / (motion.t[-1] - motion.t[0]), 0.2)
-    radius = reach / rate
+    speed = float(np.ptp(motion.positions[..., 0].mean(axis=1))) / (motion.t[-1] - motion.t[0])
+    radius = np.sign(rate) * max(speed / abs(rate), 1.2)  # in bends that are narrower, bodies would be bent double
     angle = motion.positions[..., 0] / radius
     out = motion.positions.copy()
     out[..., 0] = (radius - motion.positions[..., 1]) * np.sin(angle)

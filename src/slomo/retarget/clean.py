@@ -122,7 +122,7 @@ def despike(motion: KeypointMotion, *, size: float, window: float) -> KeypointMo
         known = np.flatnonzero(c > 0)
         if len(known):
             x = motion.positions[known, i]
-            away = np.linalg.norm(x - median_filter(x, (n, 1), mode="nearest"), axis=1)
+            away = np.linalg.norm(x - median_filter(x, (n, 1), mode="reflect"), axis=1)
             confidence[known[away > size], i] = 0.0
     return replace(motion, confidence=confidence)
 

@@ -24,6 +24,7 @@ _STEP = 0.24  # s, duration of such a step
 _FLIGHT = 0.6  # s, longer than any flight phase
 _LEVEL = 0.5  # rad, a body tilted less stands as usual
 _DRIFT = 0.3  # of the leg: ground that rises and sinks more is worth a word
+_ON_ITS_BACK = 2.0  # rad
 _AIRBORNE = 0.05  # of the frames: so much time with no foot on the ground is worth a word
 
 
@@ -135,6 +136,11 @@ def _level(
     bias = np.zeros(2)
     if config.level:
         trunk, bias = trunk.leveled(slope=slope)
+    if np.median(np.linalg.norm(trunk.tilt, axis=1)) > _ON_ITS_BACK:
+        raise InvalidData(
+            "the body lies on its back most of the time", where="key points",
+            todo="check that left and right are not exchanged and that z points up",
+        )  # fmt: skip
     report["leveled_rad"] = bias.tolist()
     report["tilt_rad"] = np.abs(trunk.tilt).max(axis=0).tolist()
     if np.linalg.norm(bias) > 0.02:

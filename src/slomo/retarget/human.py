@@ -21,6 +21,7 @@ _TURN = 0.5  # s, standard deviation of the window in which swinging arms and le
 _STILL = 0.15  # of the mean: a spread of left minus right that is noise rather than a swing
 # Squared cosine between the mean and the spread of left minus right: limbs swing up to the first, open from the second.
 _SWINGS, _OPENS = 0.5, 0.85
+_BACKWARDS = 2.0  # rad
 _TURNED_OUT = 0.8  # rad, toes further from the heading than this are not seen right
 
 
@@ -159,7 +160,7 @@ def _pointing(motion: KeypointMotion, trunk: Trunk) -> Array | None:
     """(T, 2) rad, world, continuous; the heading for a foot whose toe was never seen; None without toes."""
     if not any(seen(motion, (f"{s}_toe",)) for s in SIDES):
         return None
-    out = np.empty((len(motion.t), 2))
+    out, turns = np.empty((len(motion.t), 2)), []
     for s, side in enumerate(SIDES):
         out[:, s] = trunk.heading
         if seen(motion, (f"{side}_toe", f"{side}_ankle")):
@@ -169,7 +170,12 @@ def _pointing(motion: KeypointMotion, trunk: Trunk) -> Array | None:
             # A foot seen from its toes, as in a kneeling person's, points nowhere.
             flat = np.linalg.norm(d[:, :2], axis=1) > 0.3 * np.linalg.norm(d, axis=1)
             usual = float(np.median(turned[flat])) if flat.any() else 0.0
+            turns.append(usual)
             out[:, s] += np.clip(np.where(flat, turned, usual), -_TURNED_OUT, _TURNED_OUT)
+    if turns and min(np.abs(turns)) > _BACKWARDS:
+        raise InvalidData(
+            "the toes point backwards", where="key points", todo="check that left and right are not exchanged"
+        )
     return out
 
 
