@@ -41,6 +41,12 @@ MapOption = Annotated[
 TruthOption = Annotated[
     Path | None, typer.Option("--truth", help="truth.npz of a rendered clip: the report scores the reconstruction.")
 ]
+PlanModelOption = Annotated[
+    str | None, typer.Option("--model", metavar="point-foot|whole-body", help="What the motion must be true for.")
+]
+SolverOption = Annotated[
+    str | None, typer.Option("--solver", metavar="ddp|fatrop|ipopt", help="How it is solved, see docs/solvers.md.")
+]
 KEYPOINT_SUFFIXES = (".json", ".npz")
 BUILT_IN_SKELETONS = ("quadruped", "human")
 
@@ -200,14 +206,30 @@ def add_commands(app: typer.Typer) -> None:
         session.emit_artifact(runner.make("retarget") if "keypoints" in changes else runner.make_only("retarget"))
 
     @command(app, "optimize", runs=True)
-    def optimize(session: Session, robot: RobotOption) -> None:
+    def optimize(
+        session: Session,
+        robot: RobotOption,
+        model: PlanModelOption = None,
+        solver: SolverOption = None,
+        strict: Annotated[bool | None, typer.Option(help="Loaded feet do not slide at all.")] = None,
+        cyclic: Annotated[bool | None, typer.Option(help="One cycle of the gait, closed to repeat for ever.")] = None,
+        free_scale: Annotated[bool | None, typer.Option(help="The motion's size is a variable too.")] = None,
+        free_steps: Annotated[bool | None, typer.Option(help="Step lengths are variables too, 0.7 to 1.4 dt.")] = None,
+    ) -> None:
         """A reference that satisfies dynamics and contact: states, forces, inputs.
 
         \b
         slomo optimize --robot go1
+        slomo optimize --robot go1 --cyclic
+        slomo optimize --robot go1 --solver fatrop
+        slomo optimize --robot go1 --model whole-body
         slomo optimize --robot go1 --set optimize.mu=0.5
         """
-        session.emit_artifact(session.runner(session.project(robot)).make_only("optimize"))
+        changes = _given(model=model, solver=solver, strict=strict, cyclic=cyclic, free_scale=free_scale)
+        if free_steps is not None:
+            changes |= {"shortest_step": 0.7 if free_steps else None, "longest_step": 1.4 if free_steps else None}
+        project = session.configure({"optimize": changes}, robot)
+        session.emit_artifact(session.runner(project).make_only("optimize"))
 
     @command(app, "track", runs=True)
     def track(

@@ -179,13 +179,13 @@ def _shorten_legs(robot: Robot, reference: Reference, model: PointFootModel) -> 
 
     The hip of the model stands still, the robot's moves with the joints above it: spread legs reach less far.
     """
-    r, miss = reference, joint_motion(robot, reference).miss
-    hips = r.q[:, None, :3] + np.stack([Rotation.from_quat(r.q[:, 3:7]).apply(h) for h in model.hips], axis=1)
-    length = np.linalg.norm(hips - r.points, axis=2)
+    r, joints = reference, joint_motion(robot, reference)
+    hips = r.q[:, None, :3] + np.stack([Rotation.from_quat(r.q[:, 3:7]).apply(h) for h in model.leg_roots], axis=1)
+    length, reached = (np.linalg.norm(hips - x, axis=2) for x in (r.points, joints.reached))
     middle = (model.leg_min + model.leg_max) / 2
-    room = (miss > _MISSED) * _MARGIN * miss
-    longest = np.where((room > 0) & (length > middle), length - room, np.inf).min(axis=0)
-    shortest = np.where((room > 0) & (length <= middle), length + room, 0.0).max(axis=0)
+    missed, room = joints.miss > _MISSED, _MARGIN * joints.miss
+    longest = np.where(missed & (reached < length), length - room, np.inf).min(axis=0)
+    shortest = np.where(missed & (reached > length), length + room, 0.0).max(axis=0)
     return replace(
         model,
         leg_max=np.minimum(model.leg_max, np.maximum(longest, (middle + model.leg_max) / 2)),

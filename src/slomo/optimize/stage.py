@@ -1,6 +1,6 @@
 """Optimise: key points to a motion that the robot's point-foot model can perform, checked by a verifier of its own."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from slomo.errors import UsageError
@@ -10,12 +10,16 @@ from slomo.optimize.check import as_report, failure
 from slomo.optimize.plan import SOLVERS, Plan, Wish, make_plan
 from slomo.optimize.sequence import contact_sequence
 from slomo.optimize.solve import Settings
-from slomo.optimize.verify import tracking_table
+from slomo.optimize.verify import tracking_checks, tracking_table
+from slomo.optimize.whole_body import Refined, refine
+from slomo.optimize.whole_body_verify import point_foot_reference, verify_whole_body
 from slomo.pointfoot import PointFootModel
+from slomo.robot import Robot
 from slomo.stage import Artifact, Inputs, Progress
 from slomo.terrain import Terrain
 
-VERSION = 2
+VERSION = 3
+MODELS = ("point-foot", "whole-body")
 
 
 @dataclass(frozen=True)
@@ -23,6 +27,7 @@ class Config(problem.Weights):
     """Parameters of `slomo optimize`; the weights are those of `problem.Weights`.
 
     Attributes:
+        model: "point-foot", or "whole-body": that motion made one of the whole robot under its URDF's dynamics.
         dt: s, length of a step.
         mu: friction coefficient to plan with.
         kappa: N m, gap times normal force at the end of the homotopy.
@@ -37,6 +42,7 @@ class Config(problem.Weights):
         starts: most starts that are tried before a solve counts as failed.
     """
 
+    model: str = "point-foot"
     dt: float = 0.05
     mu: float = 0.6
     kappa: float = 5e-5
@@ -53,7 +59,7 @@ class Config(problem.Weights):
 
 
 def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
-    """The retargeted key points to `reference.npz`, `report.json` and `terrain.json`.
+    """The retargeted key points to `reference.npz`, `report.json` and `terrain.json`; `whole_body.npz` with that model.
 
     The best iterate is kept whatever comes out; `Artifact.failure` says what does not hold.
 
@@ -87,12 +93,19 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     plan = make_plan(
         robot, model, want, terrain=terrain, wish=wish, report=lambda f, m: progress.update(0.05 + 0.85 * f, m)
     )
+    whole: Refined | None = None
+    if config.model == "whole-body":
+        whole, plan = _whole_body(robot, model, plan, terrain, config, progress)
     report = make_report(plan, config)
     report["tracking"] = tracking_table(plan.reference, plan.want, model.names)
     report |= contact_sequence(plan.reference, terrain, names=model.names)
+    if whole is not None:
+        report |= {"method": f"{report['method']}; whole body by sequential quadratic programming"}
+        report["whole_body"] = {"status": whole.status, "iterations": whole.iterations, "solve_seconds": whole.seconds}
     wrong = failure(plan.checks)
-    if wrong is not None and not plan.solution.converged:
-        wrong += f"; the solver ended with: {plan.solution.status}"
+    status = plan.solution.status if whole is None else whole.status
+    if wrong is not None and status != "converged":
+        wrong += f"; the solver ended with: {status}"
     for what in plan.attempts[1:]:
         progress.note(what)
     if plan.cycle is not None:
@@ -103,11 +116,28 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
         f"{report['method']}: {plan.solution.status} after {plan.solution.iterations} steps, {plan.seconds:.1f} s for "
         f"{report['motion_seconds']:.1f} s of motion; {'not verified' if wrong else 'verified'}"
     )
+    npz = {"reference.npz": plan.reference.to_arrays()}
+    if whole is not None:
+        npz["whole_body.npz"] = whole.motion.to_arrays()
+        progress.note(f"whole body: {whole.status} after {whole.iterations} programs, {whole.seconds:.1f} s")
     return Artifact(
-        npz={"reference.npz": plan.reference.to_arrays()},
+        npz=npz,
         json={"report.json": report, "terrain.json": terrain.to_json()},
         failure=wrong,
     )
+
+
+def _whole_body(
+    robot: Robot, model: PointFootModel, plan: Plan, terrain: Terrain, config: Config, progress: Progress
+) -> tuple[Refined, Plan]:
+    """The plan for the whole robot: its own checks instead of the point-foot model's, and its motion as a reference."""
+    whole = refine(
+        robot, plan.reference, terrain=terrain, mu=config.mu, report=lambda f, m: progress.update(0.9 + 0.09 * f, m)
+    )
+    checks = verify_whole_body(robot, whole.motion, terrain=terrain, mu=config.mu)
+    reference = point_foot_reference(robot, model, whole.motion)
+    checks |= tracking_checks(reference, plan.want, model.names)
+    return whole, replace(plan, reference=reference, checks=checks)
 
 
 def _check(config: Config) -> None:
@@ -121,6 +151,10 @@ def _check(config: Config) -> None:
         raise UsageError(
             f"1 does not lie between {config.shortest_step} and {config.longest_step}", where="optimize.shortest_step"
         )
+    if config.model not in MODELS:
+        raise UsageError(f"no model {config.model!r}", where="optimize.model", valid=MODELS)
+    if config.model != "point-foot" and config.cyclic:
+        raise UsageError("a cycle closes for the point-foot model only", where="optimize.cyclic")
     if config.solver not in SOLVERS:
         raise UsageError(f"no solver {config.solver!r}", where="optimize.solver", valid=tuple(SOLVERS))
 
