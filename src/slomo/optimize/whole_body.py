@@ -66,7 +66,7 @@ class Refined:
 # What counts as satisfied, in the units of `Violations`: N and N m, parts of a limit (within the margin), m, N m.
 _SATISFIED = Penalties(base=5e-7, torque=5e-4, speed=5e-4, depth=1e-5, contact=2e-5, slide=5e-5)
 # Share of the cost below which the price of what is violated is left to closing.
-_NEARLY = 0.01
+_NEARLY = 0.03
 # Of the cost, in relative tolerances: a millimetre off for two seconds.
 _FLOOR = 1e-3
 _MOST_RAISES = 3
@@ -132,10 +132,9 @@ def _descend(
             price = x.violations.price(penalties)
             trial = problem.evaluate(plus(x.q, step.dq), step.lam)
             actual = x.cost + price - trial.cost - trial.violations.price(penalties)
-            settled = step.decrease < s.tolerance * (x.cost + price + _FLOOR)
-            if settled and price < _NEARLY * (x.cost + _FLOOR):
+            if price < _NEARLY * (x.cost + _FLOOR) and step.decrease - price < s.tolerance * (x.cost + _FLOOR):
                 return x, "converged", n
-            if settled:
+            if step.decrease < s.tolerance * (x.cost + price + _FLOOR):
                 # What is violated cannot be mended at this price.
                 lacking = x.violations.beyond(_SATISFIED)
                 if raises == _MOST_RAISES:
@@ -144,7 +143,7 @@ def _descend(
                 penalties = penalties._replace(**{name: 10 * getattr(penalties, name) for name in lacking})
             if actual > 0.1 * step.decrease:
                 x = trial
-                damping *= 0.2 if actual > 0.7 * step.decrease else 1.0
+                damping *= 0.2 if actual > 0.5 * step.decrease else 1.0
             else:
                 damping *= 5.0
         if damping > 1e8:

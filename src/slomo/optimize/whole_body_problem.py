@@ -27,7 +27,7 @@ class Weights:
     position: float = 1000.0
     orientation: float = 200.0
     point: float = 1000.0
-    posture: float = 1.0
+    posture: float = 10.0
     base_acceleration: float = 0.05
     joint_acceleration: float = 1e-4
     torque: float = 0.1

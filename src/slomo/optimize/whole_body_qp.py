@@ -63,12 +63,12 @@ class Penalties(NamedTuple):
     """Price of a slack: base force or torque (1/N, 1/N m), torque and speed as a part of their limit, depth (1/m),
     gap x force and slide x force (1/N m)."""
 
-    base: float = 1.0
+    base: float = 0.1
     torque: float = 100.0
     speed: float = 100.0
-    depth: float = 1e4
-    contact: float = 1e3
-    slide: float = 1e3
+    depth: float = 1e3
+    contact: float = 100.0
+    slide: float = 100.0
 
 
 class Layout:
