@@ -132,7 +132,7 @@ def find_urdf(section: UrdfSection, robot_file: Path) -> tuple[Path, tuple[Path,
 
 def find_mesh(address: str, urdf: Path, package_dirs: tuple[Path, ...]) -> Path:
     """File behind a mesh address of the URDF. Raises `InvalidData` when there is none."""
-    relative = address.removeprefix("package://")
+    relative = address.removeprefix("package://").lstrip("/")
     for folder in (*package_dirs, urdf.parent):
         if (folder / relative).is_file():
             return folder / relative

@@ -54,9 +54,12 @@ def _prepare(spec: mujoco.MjSpec, robot: Robot, friction: float) -> None:
     """Root, inertia, collision shapes and motors."""
     spec.compiler.fusestatic = True
     spec.worldbody.first_body().add_freejoint(name="root")
-    for joint in list(spec.joints):
-        if any(fnmatchcase(joint.name, pattern) for pattern in robot.locked):
-            spec.delete(joint)
+    locked = {j.name for j in spec.joints if any(fnmatchcase(j.name, pattern) for pattern in robot.locked)}
+    for equality in list(spec.equalities):  # joints that mimic another one
+        if {equality.name1, equality.name2} & locked:
+            spec.delete(equality)
+    for name in locked:
+        spec.delete(spec.joint(name))
     # Each body that moves weighs what Pinocchio's does, in which all that is fixed to it, and the repairs of
     # `load_robot`, are counted already.
     for body in spec.bodies:
