@@ -29,7 +29,7 @@ class Weights:
     point: float = 1000.0
     posture: float = 10.0
     base_acceleration: float = 0.05
-    joint_acceleration: float = 1e-4
+    joint_acceleration: float = 1e-5
     torque: float = 0.1
     force: float = 1e-4
 
