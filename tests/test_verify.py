@@ -22,7 +22,7 @@ FLAT = Terrain()
 BODY = np.array([0.0, 0.0, ROBOT.standing_height, 0, 0, 0, 1])
 FEET = ROBOT.nominal_feet * [1, 1, 0]
 REST = standing(MODEL, BODY, FEET)
-LEG = np.linalg.norm(ROBOT.nominal_hips + BODY[:3] - FEET, axis=1)
+LEG = np.linalg.norm(MODEL.leg_roots + BODY[:3] - FEET, axis=1)
 LEFT, RIGHT, HIND_LEFT = 0, 1, 2
 
 
