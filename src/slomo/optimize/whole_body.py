@@ -125,7 +125,7 @@ def _descend(
     penalties, damping, raises = Penalties(), 1.0, 0
     for n in range(1, s.iterations + 1):
         report(n / (n + 10), f"whole body, step {n}")
-        step = program.solve(problem.linearize(x), penalties, damping=damping * problem.scale, tolerance=1e-7)
+        step = program.solve(problem.linearize(x), penalties, damping=damping * problem.scale, tolerance=1e-5)
         if not step.solved:
             damping *= 10.0
         else:
