@@ -3,7 +3,7 @@
     python tests/bench_random.py                       # 200 inputs: 100 animals on go1, 100 people on g1
     python tests/bench_random.py --count 40 --kind quadruped --first 1000 --json
 
-Each input is drawn from its seed (`ugly`): noise, spikes, dropped frames, scale, heading, friction 0.3 to 1.0, terrain steps.
+Each input is drawn from its seed (`ugly`): noise, spikes, dropped frames, scale, heading, friction, terrain steps.
 A refusal is an error before anything is solved, in one line. What was solved but does not verify is counted apart: it
 is an exit 1 with the offender's name for the user, and a miss for this bench.
 """

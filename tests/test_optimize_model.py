@@ -1,5 +1,7 @@
 """Contact, dynamics and cost: known answers, and every derivative against finite differences and CasADi."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from slomo.optimize.dynamics import Body
 from slomo.optimize.iterate import Iterate, Work
 from slomo.optimize.riccati import backward
 from slomo.pointfoot import PointFootModel
+from slomo.robot_workspace import directions
 
 HIPS = np.array([[0.188, 0.1268, 0], [0.188, -0.1268, 0], [-0.188, 0.1268, 0], [-0.188, -0.1268, 0]])
 
@@ -271,9 +274,10 @@ def test_constraints_and_their_derivatives():
     model = make_model(
         6, pairs=[[0, 1], [3, 2]], pair_length=[0.2, 0.3], clearance=[0.3, 0.3, 0.3, 0.3, -np.inf, -np.inf]
     )
-    body = Body.of(model)
+    room = np.where(rng.random((6, len(directions()))) < 0.3, 0.4, np.inf)
+    body = Body.of(replace(model, workspace=room))
     M = constraints.number(body)
-    assert M == 24
+    assert 24 + room.size == M
     assert [constraints.is_equality(body, n) for n in range(M)] == [18 <= n < 20 for n in range(M)]
     q, _, _ = random_state(rng, 6)
     g = np.zeros(M)
@@ -284,6 +288,7 @@ def test_constraints_and_their_derivatives():
     assert np.all(np.isinf(g[16:18]))
     assert g[19] == pytest.approx(np.linalg.norm(points[3] - points[2]) - 0.3)
     assert g[20] == pytest.approx(points[0, 2] - points[1, 2] - 0.2 * np.sin(constraints.TILT))
+    assert g[24:].reshape(room.shape) == pytest.approx(R.inv().apply(points - q[:3]) @ directions().T - room)
 
     def at(d):
         qa, va, out = np.zeros(25), np.zeros(24), np.zeros(M)
@@ -388,7 +393,7 @@ def test_newton_step_solves_the_linear_quadratic_problem():
     body, task = Body.of(model), make_task(rng, C, N)
     q = np.tile(task.q_ref[:1], (N + 1, 1))
     q[:, 2], q[:, 9::3] = 2.0, 1.5
-    it = Iterate.at(q, np.zeros((N + 1, 18)), np.zeros((N, 12)), C=C, P=0)
+    it = Iterate.at(q, np.zeros((N + 1, 18)), np.zeros((N, 12)), C=C, M=constraints.number(body))
     w = Work.make(it)
     ddp.evaluate(body, task, 1e-4, it, 1.0, w.gap, w)
     assert backward(body, task, 1e-4, it, 1.0, 0.0, False, w)

@@ -15,6 +15,7 @@ import numpy as np
 
 from slomo.errors import InvalidData
 from slomo.robot import Robot, key_point_names
+from slomo.robot_workspace import directions
 
 Array = np.ndarray
 GRAVITY = 9.81  # m/s^2
@@ -37,6 +38,8 @@ class PointFootModel:
         pair_length: (P,) m.
         clearance: (C,) m, least distance of a point below the body's origin along the body's z axis; -inf where
             the point is free (a hand).
+        workspace: (C, K) m, offsets of the half-spaces of `robot_workspace` that hold the points in the body frame; inf
+            where there is none.
         leg_roots: (C, 3) m, body frame: where leg lengths are measured from; the hips unless given.
     """
 
@@ -53,6 +56,7 @@ class PointFootModel:
     pairs: Array = field(default_factory=lambda: np.zeros((0, 2), int))
     pair_length: Array = field(default_factory=lambda: np.zeros(0))
     clearance: Array = field(default_factory=lambda: np.array(-np.inf))  # one number counts for every point
+    workspace: Array = field(default_factory=lambda: np.array(np.inf))
     leg_roots: Array = field(default_factory=lambda: np.zeros((0, 3)))  # none: the hips
 
     def __post_init__(self):
@@ -77,6 +81,11 @@ class PointFootModel:
         if clearance.shape not in ((), (C,)) or not np.all(clearance < np.inf):
             raise InvalidData(f"needs {C} numbers below infinity", where="model clearance")
         object.__setattr__(self, "clearance", np.full(C, clearance))
+        K = len(directions())
+        room = np.asarray(self.workspace, float)
+        if room.shape not in ((), (C, K)) or np.any(np.isnan(room)):
+            raise InvalidData(f"needs numbers of shape {(C, K)}", where="model workspace")
+        object.__setattr__(self, "workspace", np.ascontiguousarray(np.broadcast_to(room, (C, K))))
 
     def _check_pairs(self, C: int) -> None:
         pairs = np.ascontiguousarray(np.reshape(self.pairs, (-1, 2)), dtype=np.int64)
@@ -123,5 +132,6 @@ class PointFootModel:
             pairs=robot.pairs,
             pair_length=robot.pair_length,
             clearance=robot.clearance,
+            workspace=robot.workspace,
             leg_roots=robot.leg_roots,
         )

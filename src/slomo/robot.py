@@ -26,6 +26,7 @@ from slomo.robot_model import (
     position_limits,
     repair_base_inertia,
 )
+from slomo.robot_workspace import workspace
 
 Array = np.ndarray
 
@@ -188,6 +189,14 @@ class Robot:
         under = np.full(len(self.limbs), -low) if np.isfinite(low) else -self.nominal_hips[:, 2]
         under = under + [limb.foot_radius for limb in self.limbs]
         return np.where([limb.is_hand for limb in self.limbs], -np.inf, under)
+
+    @cached_property
+    def workspace(self) -> Array:
+        """(C, K) m, offsets of the half-spaces in the base frame that hold each point (see `robot_workspace`)."""
+        return workspace(
+            self.model, self.q_nominal, self.base, self.foot_names, lower=self.lower, upper=self.upper,
+            below=self.clearance,
+        )  # fmt: skip
 
     @cached_property
     def composite(self) -> pin.Inertia:

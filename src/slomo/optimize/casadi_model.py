@@ -16,6 +16,7 @@ from slomo.optimize.casadi_nlp import Fields
 from slomo.optimize.constraints import TILT
 from slomo.optimize.cost import Task
 from slomo.pointfoot import PointFootModel
+from slomo.robot_workspace import directions
 
 Array = np.ndarray
 
@@ -143,6 +144,11 @@ def limits(model: PointFootModel, x: ca.SX, quat_ref: ca.SX) -> tuple[ca.SX, Arr
         rows.append(ca.dot(R[:, 2], s.p - s.f[:, int(c)]))
         low.append(model.clearance[c])
         high.append(np.inf)
+    normals = directions()
+    for c, k in np.argwhere(np.isfinite(model.workspace)):
+        rows.append(ca.dot(ca.mtimes(R, ca.DM(normals[k])), s.f[:, int(c)] - s.p))
+        low.append(-np.inf)
+        high.append(model.workspace[c, k])
     for (i, j), length in zip(model.pairs, model.pair_length, strict=True):
         apart = s.f[:, int(i)] - s.f[:, int(j)]
         rows += [ca.dot(apart, apart), apart[2]]

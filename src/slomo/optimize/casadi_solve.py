@@ -13,7 +13,7 @@ from slomo.optimize.casadi_nlp import Knot, OptimalControl
 from slomo.optimize.cost import Task
 from slomo.optimize.dynamics import Body
 from slomo.optimize.iterate import Iterate
-from slomo.optimize.solve import Settings, Solution
+from slomo.optimize.solve import Settings, Solution, differs
 from slomo.terrain import Terrain
 
 Array = np.ndarray
@@ -107,15 +107,13 @@ def run(
             status = "converged" if result.success else result.status
             if status == "iteration limit" and most < settings.iterations:
                 status = "time limit"
-            ground = terrain.planes(it.qs[:, 7:].reshape(len(it.qs), -1, 3))
-            moved = not np.allclose(ground, task.ground, rtol=0, atol=1e-9)
+            ground = np.ascontiguousarray(terrain.planes(it.qs[:, 7:].reshape(len(it.qs), -1, 3)))
+            moved = differs(task, ground, it)
             if last and result.success and moved:
                 status = "feet keep crossing an edge of the terrain"
             elif last:
                 break
-            task = task._replace(ground=np.ascontiguousarray(ground)) if moved else task
-        if last and status == "converged" and kappa != settings.kappas[-1]:
-            status = "time limit"
+            task = task._replace(ground=ground) if moved else task
     seconds = time.perf_counter() - began
     return Solution(it, status, iterations, cost, _violation(form.body, it), "targets", 1, seconds, compile_seconds)
 

@@ -1,13 +1,14 @@
 """State constraints g(q) <= 0 (and = 0), which the solver holds by an augmented Lagrangian.
 
-For C points and P pairs (toe and heel of a foot), in this order:
+For C points, P pairs and K directions (toe and heel of a foot), in this order:
 
     C   leg_min <= |p + R hip - f|                   C   |p + R hip - f| <= leg_max
     C   (R^T (f - p))_z <= -clearance                points stay below the body
+    C K n . R^T (f - p) <= d                         and within the hull of what their joints reach (last)
     P   |f_a - f_b| = pair_length                    2 P |(f_a - f_b)_z| <= pair_length sin(TILT): feet stay about level
 """
 
-from math import inf, sin, sqrt
+from math import sin, sqrt
 
 import numpy as np
 
@@ -21,7 +22,7 @@ _SIN_TILT = sin(TILT)
 @compiled
 def number(body):
     """How many constraints a state has."""
-    return 3 * body.hips.shape[0] + 3 * body.pairs.shape[0]
+    return body.hips.shape[0] * (3 + body.directions.shape[0]) + 3 * body.pairs.shape[0]
 
 
 @compiled
@@ -42,6 +43,15 @@ def _leg(body, q, R, c, d):
 
 
 @compiled
+def _place(q, R, c, x):
+    """x (3,) = R^T (f - p), a point in the body frame."""
+    for i in range(3):
+        x[i] = 0.0
+        for k in range(3):
+            x[i] += R[k, i] * (q[7 + 3 * c + k] - q[k])
+
+
+@compiled
 def _apart(body, q, p, d):
     """Vector d (3,) from the second to the first point of pair p and its length."""
     a, b = 7 + 3 * body.pairs[p, 0], 7 + 3 * body.pairs[p, 1]
@@ -56,16 +66,16 @@ def values(body, q, out):
     C, P = body.hips.shape[0], body.pairs.shape[0]
     R, d = np.empty((3, 3)), np.empty(3)
     so3.matrix(q[3:7], R)
+    K = body.directions.shape[0]
     for c in range(C):
         length = _leg(body, q, R, c, d)
         out[c] = body.leg_min[c] - length
         out[C + c] = length - body.leg_max[c]
-        out[2 * C + c] = -inf
-        if body.clearance[c] > -inf:
-            z = 0.0
-            for i in range(3):
-                z += R[i, 2] * (q[7 + 3 * c + i] - q[i])
-            out[2 * C + c] = z + body.clearance[c]
+        _place(q, R, c, d)
+        out[2 * C + c] = d[2] + body.clearance[c]
+        for k in range(K):
+            n = body.directions[k]
+            out[3 * C + 3 * P + c * K + k] = n[0] * d[0] + n[1] * d[1] + n[2] * d[2] - body.workspace[c, k]
     for p in range(P):
         length = _apart(body, q, p, d)
         out[3 * C + p] = length - body.pair_length[p]
@@ -95,16 +105,20 @@ def gradient(body, q, R, n, index, grad):
             grad[i], grad[6 + i] = sign * d[i], -sign * d[i]
             index[i], index[3 + i], index[6 + i] = i, 3 + i, 6 + 3 * c + i
         return 9
-    if n < 3 * C:
-        c = n - 2 * C
+    if n < 3 * C or n >= 3 * C + 3 * P:
+        K = body.directions.shape[0]
+        c = n - 2 * C if n < 3 * C else (n - 3 * C - 3 * P) // K
+        a0, a1, a2 = 0.0, 0.0, 1.0
+        if n >= 3 * C:
+            normal = body.directions[(n - 3 * C - 3 * P) % K]
+            a0, a1, a2 = normal[0], normal[1], normal[2]
+        _place(q, R, c, d)
         for i in range(3):
-            d[i] = 0.0
-            for k in range(3):
-                d[i] += R[k, i] * (q[7 + 3 * c + k] - q[k])
-            grad[i], grad[6 + i] = -R[i, 2], R[i, 2]
+            grad[6 + i] = R[i, 0] * a0 + R[i, 1] * a1 + R[i, 2] * a2
+            grad[i] = -grad[6 + i]
             index[i], index[3 + i], index[6 + i] = i, 3 + i, 6 + 3 * c + i
         # x = R^T (f - p): dx = [x] w.
-        grad[3], grad[4], grad[5] = -d[1], d[0], 0.0
+        grad[3], grad[4], grad[5] = a1 * d[2] - a2 * d[1], a2 * d[0] - a0 * d[2], a0 * d[1] - a1 * d[0]
         return 9
     p = (n - 3 * C) % P
     a, b = 6 + 3 * body.pairs[p, 0], 6 + 3 * body.pairs[p, 1]

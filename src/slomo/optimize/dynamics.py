@@ -15,6 +15,7 @@ from slomo.optimize import so3
 from slomo.optimize.contact import contact_derivative, contact_force
 from slomo.optimize.jit import compiled
 from slomo.pointfoot import PointFootModel
+from slomo.robot_workspace import directions
 
 Array = np.ndarray
 
@@ -32,6 +33,8 @@ class Body(NamedTuple):
     pairs: Array
     pair_length: Array
     clearance: Array
+    directions: Array
+    workspace: Array
     mu: float
     g: float
 
@@ -48,6 +51,8 @@ class Body(NamedTuple):
             model.pairs,
             model.pair_length,
             model.clearance,
+            directions(),
+            model.workspace,
             float(model.mu),
             float(model.g),
         )

@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 
 from slomo.optimize import casadi_model as cm
+from slomo.optimize import constraints
 from slomo.optimize.casadi_cycle import CyclicForm
 from slomo.optimize.casadi_nlp import Knot
 from slomo.optimize.casadi_solve import SECONDS, Plugin, run
@@ -76,7 +77,7 @@ class SmoothForm:
         qs, vs = cm.from_tangent(task, np.vstack([z[:, : self._nx], end]))
         C = task.ground.shape[1]
         us = np.clip(z[:, self._nx :], task.u_low, task.u_high)
-        it = Iterate.at(qs, vs, us, C=C, P=len(self.body.pairs))
+        it = Iterate.at(qs, vs, us, C=C, M=constraints.number(self.body))
         q1, v1 = np.empty(qs.shape[1]), np.empty(vs.shape[1])
         for k in range(len(z)):
             h = it.us[k, 3 * C] if it.us.shape[1] > 3 * C else task.h[k]

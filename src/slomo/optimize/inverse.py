@@ -8,7 +8,8 @@ put every contact frame on its point, the one nearest to a home,
 by Gauss-Newton steps, damped by the error's own size (Sugihara, "Solvability-unconcerned inverse kinematics by the
 Levenberg-Marquardt method", 2011), with joints held at a limit that they would cross. S makes joints that move heavy
 parts dear, so that an arm is used before the trunk. Where joints are redundant, home is a little of the way from the
-last knot's angles to the nominal ones, and in a second pass the first one's, smoothed in time.
+last knot's angles to the nominal ones, and in a second pass the first one's, smoothed in time; and no joint turns faster
+than it can.
 
 Inverse dynamics, of each step: the recursive Newton-Euler algorithm (Featherstone 2008, section 5.3) with the step's
 contact forces at the contact frames and the accelerations of the reference's own integrator, a = (v_next - v) / h. It
@@ -34,6 +35,7 @@ STILL = 1e-4  # rad, a step after which the iteration ends
 ITERATIONS = 30
 PULL = np.minimum(1.0, 0.7 ** (np.arange(ITERATIONS) - 8))  # home gives way at last: with limits it can go in circles
 RETURN = 0.5  # s in which redundant joints come back to their nominal angles
+FASTEST = 0.95  # of a joint's speed limit, where others can help it
 SMOOTHING = 0.3  # s, of the redundant joints' home in the second pass
 
 
@@ -73,10 +75,13 @@ def joint_motion(robot: Robot, reference: Reference) -> JointMotion:
     q[:, :7], v[:, :6] = root[:, :7], root[:, 7:]
     nominal = np.tile(robot.q_nominal[7:], (T, 1))
     keep = np.exp(-np.concatenate([[np.inf], r.h]) / RETURN)
-    q[:, 7:], error = legs.sweep(root[:, :7], r.points, nominal, keep)
-    if nj > len(legs.error):
+    redundant = nj > len(legs.error)
+    rate = FASTEST * robot.velocity if redundant else np.full(nj, np.inf)
+    change = np.vstack([np.full(nj, np.inf), r.h[:, None] * rate])
+    q[:, 7:], error = legs.sweep(root[:, :7], r.points, nominal, keep, change)
+    if redundant:
         home = gaussian_filter1d(q[:, 7:], SMOOTHING * (T - 1) / (r.t[-1] - r.t[0]), axis=0, mode="nearest")
-        q[:, 7:], error = legs.sweep(root[:, :7], r.points, home, np.zeros(T))
+        q[:, 7:], error = legs.sweep(root[:, :7], r.points, home, np.zeros(T), change)
     v[1:, 6:] = np.diff(q[:, 7:], axis=0) / r.h[:, None]
     v[0, 6:] = legs.velocities(q[0], v[0, :6], v[1, 6:], r.v[0, 6:])
 
@@ -153,22 +158,26 @@ class _Legs:
             out[3 * len(self.points) + i] = -FLAT * (self.data.oMi[joint].rotation[2] @ axis)
         return out
 
-    def sweep(self, root: Array, points: Array, home: Array, keep: Array) -> tuple[Array, Array]:
+    def sweep(self, root: Array, points: Array, home: Array, keep: Array, change: Array) -> tuple[Array, Array]:
         """`solve` at every knot, each from the one before: joints (T, nj) rad and what is missing (T, C, 3) m.
 
         Args:
             home: (T, nj) rad.  keep: (T,) share of the last knot's angles in the home of each.
+            change: (T, nj) rad, most that joints may turn since the last knot.
         """
         joints, error = np.empty(home.shape), np.empty(points.shape)
         last = home[0]
         for k in range(len(root)):
-            last = joints[k] = self.solve(root[k], last, points[k], keep[k] * last + (1 - keep[k]) * home[k])
+            lower = np.maximum(self.robot.lower, last - change[k])
+            upper = np.minimum(self.robot.upper, last + change[k])
+            aim = keep[k] * last + (1 - keep[k]) * home[k]
+            last = joints[k] = self.solve(root[k], last, points[k], aim, lower, upper)
             error[k] = self.error[: points[k].size].reshape(-1, 3)
         return joints, error
 
-    def solve(self, root: Array, joints: Array, points: Array, home: Array) -> Array:
+    def solve(self, root: Array, joints: Array, points: Array, home: Array, lower: Array, upper: Array) -> Array:
         """(nj,) rad that bring the contact frames to points (C, 3), from a first guess, with the root at (7,)."""
-        lower, upper, scale = self.robot.lower, self.robot.upper, self._scale
+        scale = self._scale
         q = np.concatenate([root, joints])
         for i in range(ITERATIONS):
             J = self.jacobian(q)[:, 6:] / scale

@@ -18,6 +18,7 @@ import casadi as ca
 import numpy as np
 
 from slomo.optimize import casadi_model as cm
+from slomo.optimize import constraints
 from slomo.optimize.casadi_cycle import CyclicForm
 from slomo.optimize.casadi_nlp import Fields, Knot
 from slomo.optimize.casadi_solve import SECONDS, Plugin, run
@@ -117,7 +118,7 @@ class ComplementarityForm:
         n, (N, C) = self.names, task.stick.shape
         qs, vs = cm.from_tangent(task, np.vstack([z[:, n["x"]], end]))
         us = np.clip(z[:, n["u"]], task.u_low, task.u_high)
-        it = Iterate.at(qs, vs, us, C=C, P=len(self.body.pairs))
+        it = Iterate.at(qs, vs, us, C=C, M=constraints.number(self.body))
         gamma, beta = z[:, n["gamma"]], z[:, n["beta"]].reshape(N, C, 4)
         for k, c in np.ndindex(N, C):
             plane, b = task.ground[k + 1, c], beta[k, c]

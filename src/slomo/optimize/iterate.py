@@ -24,11 +24,11 @@ class Iterate(NamedTuple):
     closing: Array
 
     @classmethod
-    def at(cls, qs: Array, vs: Array, us: Array, *, C: int, P: int) -> Self:
-        """An iterate at copies of these, for C points and P pairs, with no forces and multipliers yet."""
+    def at(cls, qs: Array, vs: Array, us: Array, *, C: int, M: int) -> Self:
+        """An iterate at copies of these, for C points and M constraints, with no forces and multipliers yet."""
         z, N = np.zeros, len(us)
         qs, vs, us = (np.array(x, float, order="C") for x in (qs, vs, us))
-        return cls(qs, vs, us, z((N, C, 3)), z((N + 1, 3 * C + 3 * P)), z((N, C)), z(12 + 6 * C))
+        return cls(qs, vs, us, z((N, C, 3)), z((N + 1, M)), z((N, C)), z(12 + 6 * C))
 
     def copy(self) -> Self:
         """A deep copy."""

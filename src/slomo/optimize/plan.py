@@ -26,6 +26,7 @@ from slomo.optimize.solve import Report, Settings, Solution
 from slomo.optimize.verify import verify
 from slomo.pointfoot import PointFootModel
 from slomo.robot import Robot
+from slomo.robot_workspace import directions
 from slomo.terrain import Terrain
 
 Array = np.ndarray
@@ -36,7 +37,7 @@ SOLVERS = {
     "fatrop": ("slomo.optimize.fatrop", "solve_fatrop", "Fatrop, smooth contact"),
     "ipopt": ("slomo.optimize.ipopt", "solve_ipopt", "IPOPT, complementarity constraints"),
 }
-ATTEMPTS = 5
+ATTEMPTS = 9
 _MISSED, _MARGIN = 1e-3, 1.3  # m from which on a miss counts, and by what factor of it a leg is made shorter
 _TIGHTER = 0.9  # of the force that would keep a joint just within its torque limit
 
@@ -121,12 +122,16 @@ def make_plan(
         # From the solution with fixed steps: it is a point of this problem, so that freedom cannot make it worse.
         task, it = make_task(want, wish.steps), solution.iterate
         solution = solve(task, it._replace(us=np.column_stack([it.us, task.u_ref[:, -1]])))
-    settings, why = wish.settings, "targets"
+    settings, why, best = wish.settings, "targets", None
     while True:
         attempts.append(f"{why}: {solution.status}, start {solution.start!r}, {solution.iterations} steps")
         reference = _reference(robot, model, task, solution)
         checks = verify(model, reference, terrain=terrain, robot=robot, want=want)
         wrong = {name for name, c in checks.items() if not c.holds}
+        # Of attempts that all fail, the one that is least wrong is kept.
+        badness = sum(min(c.value / c.limit, 1e3) for c in checks.values() if not c.holds)
+        if best is None or badness < best[0]:
+            best = badness, reference, checks, solution
         if wish.solver != "ddp" or len(attempts) >= ATTEMPTS or not wrong:
             break
         if "slip_per_second" in wrong and not settings.strict:
@@ -134,11 +139,12 @@ def make_plan(
         elif "torque_ratio" in wrong:
             task, why = _limit_forces(robot, reference, task), "forces limited where joints were overloaded"
         elif "joint_miss" in wrong:
-            legs, why = _shorten_legs(robot, reference, legs), "legs made shorter where joint limits kept a foot back"
+            legs, why = _less_room(robot, reference, legs), "less room where joint limits kept a point back"
         else:
             break
         report(0.0, why)
         solution = solve(task, solution.iterate, settings)
+    _, reference, checks, solution = best
     return Plan(reference, checks, want, solution, tuple(attempts), scale, cycle, seconds)
 
 
@@ -174,20 +180,29 @@ def _limit_forces(robot: Robot, reference: Reference, task: Task) -> Task:
     return task._replace(u_low=u_low, u_high=u_high)
 
 
-def _shorten_legs(robot: Robot, reference: Reference, model: PointFootModel) -> PointFootModel:
-    """The model with less room for the length of a leg whose foot the joints cannot bring where the reference has it.
+def _less_room(robot: Robot, reference: Reference, model: PointFootModel) -> PointFootModel:
+    """The model with less room for a point that the joints cannot bring where the reference has it.
 
-    The hip of the model stands still, the robot's moves with the joints above it: spread legs reach less far.
+    A point missed along its leg changes the leg's limits. One missed across it moves the half-space of its workspace
+    that looks most in that direction: the hull of what joints reach is larger than what they reach.
     """
-    r, joints = reference, joint_motion(robot, reference)
-    hips = r.q[:, None, :3] + np.stack([Rotation.from_quat(r.q[:, 3:7]).apply(h) for h in model.leg_roots], axis=1)
-    length, reached = (np.linalg.norm(hips - x, axis=2) for x in (r.points, joints.reached))
-    middle = (model.leg_min + model.leg_max) / 2
-    missed, room = joints.miss > _MISSED, _MARGIN * joints.miss
-    longest = np.where(missed & (reached < length), length - room, np.inf).min(axis=0)
-    shortest = np.where(missed & (reached > length), length + room, 0.0).max(axis=0)
-    return replace(
-        model,
-        leg_max=np.minimum(model.leg_max, np.maximum(longest, (middle + model.leg_max) / 2)),
-        leg_min=np.maximum(model.leg_min, np.minimum(shortest, (middle + model.leg_min) / 2)),
-    )
+    joints = joint_motion(robot, reference)
+    R = Rotation.from_quat(reference.q[:, 3:7])
+    leg_min, leg_max, workspace = model.leg_min.copy(), model.leg_max.copy(), model.workspace.copy()
+    normals = directions()
+    for c in range(model.C):
+        wanted, reached = (R.inv().apply(x[:, c] - reference.q[:, :3]) for x in (reference.points, joints.reached))
+        for k in np.flatnonzero(joints.miss[:, c] > _MISSED):
+            off = wanted[k] - reached[k]
+            far, near = (float(np.linalg.norm(x[k] - model.leg_roots[c])) for x in (wanted, reached))
+            if abs(far - near) > 0.7 * np.linalg.norm(off):
+                room = far + _MARGIN * (near - far)
+                middle = (model.leg_min[c] + model.leg_max[c]) / 2
+                if far > near:
+                    leg_max[c] = min(leg_max[c], max(room, (middle + model.leg_max[c]) / 2))
+                else:
+                    leg_min[c] = max(leg_min[c], min(room, (middle + model.leg_min[c]) / 2))
+            else:
+                n = int(np.argmax(normals @ off))
+                workspace[c, n] = min(workspace[c, n], normals[n] @ (wanted[k] - _MARGIN * off))
+    return replace(model, leg_max=leg_max, leg_min=leg_min, workspace=workspace)

@@ -7,7 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from slomo.errors import InvalidData
 from slomo.motion import KeypointMotion
+from slomo.optimize import constraints
 from slomo.optimize.cost import Task
+from slomo.optimize.dynamics import Body
 from slomo.optimize.iterate import Iterate
 from slomo.pointfoot import PointFootModel
 from slomo.terrain import Terrain
@@ -178,4 +180,4 @@ def make_start(model: PointFootModel, want: Targets, task: Task) -> Iterate:
     u[..., 2] = share[1:] * model.mass * model.g - (gap[1:] > 0.01) * model.foot_mass * model.g
     us = task.u_ref.copy()
     us[:, : 3 * C] = u.reshape(T - 1, -1)
-    return Iterate.at(want.q, want.v, np.clip(us, task.u_low, task.u_high), C=C, P=len(model.pairs))
+    return Iterate.at(want.q, want.v, np.clip(us, task.u_low, task.u_high), C=C, M=constraints.number(Body.of(model)))

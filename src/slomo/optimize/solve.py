@@ -97,7 +97,7 @@ def warm_up(model: PointFootModel) -> float:
         u_low=np.full((N, 3 * C), -1.0), u_high=np.ones((N, 3 * C)), w_acceleration=1.0, w_slip=1.0, slip_load=1.0,
         cyclic=False, shift=np.zeros(4),
     )  # fmt: skip
-    it = Iterate.at(q, np.zeros((N + 1, nv)), np.zeros((N, 3 * C)), C=C, P=len(model.pairs))
+    it = Iterate.at(q, np.zeros((N + 1, nv)), np.zeros((N, 3 * C)), C=C, M=constraints.number(Body.of(model)))
     body, work = Body.of(model), Work.make(it)
     ddp.solve(body, task, 1.0, it, 1.0, True, 1, 1e-6, 1e-6, 1e-6, work)
     ddp.close(body, task, 1.0, it, work)
@@ -213,7 +213,7 @@ def _descend(
                 raise StageFailed("met numbers that are not finite", where="optimize", todo="check the key points")
             worst = multipliers.update(body, task, it, s)
             ground = np.ascontiguousarray(terrain.planes(it.qs[:, 7:].reshape(len(it.qs), -1, 3)))
-            moved = _differs(task, ground, it)
+            moved = differs(task, ground, it)
             new = strict and np.any(_normal_forces(task, it)[~task.stick] > LOADED)
             failure = "" if status == ddp.CONVERGED else ddp.STATUS[status]
             if worst > 1.0:
@@ -256,7 +256,7 @@ def _normal_forces(task: Task, it: Iterate) -> Array:
     return np.sum(task.ground[1:, :, :3] * it.lam, axis=2)
 
 
-def _differs(task: Task, ground: Array, it: Iterate) -> bool:
+def differs(task: Task, ground: Array, it: Iterate) -> bool:
     """Whether planes (N + 1, C, 4) put a point at another height than those of the task, as far as it matters."""
     points = it.qs[:, 7:].reshape(len(it.qs), -1, 3)
     change = ground - task.ground

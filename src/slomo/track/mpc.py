@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slomo.motion import Reference
-from slomo.optimize import ddp, so3
+from slomo.optimize import constraints, ddp, so3
 from slomo.optimize.cost import Task
 from slomo.optimize.dynamics import Body, minus
 from slomo.optimize.iterate import Iterate, Work
@@ -211,7 +211,7 @@ class Mpc:
 
     def _new_iterate(self) -> Iterate:
         task = self._task
-        return Iterate.at(task.q_ref, task.v_ref, task.u_ref, C=self.model.C, P=len(self.model.pairs))
+        return Iterate.at(task.q_ref, task.v_ref, task.u_ref, C=self.model.C, M=constraints.number(self._body))
 
     def reset(self) -> None:
         """Forget the last plan; the next step starts from the reference."""
