@@ -12,6 +12,7 @@ from slomo.rotation import rot_z
 from slomo.terrain import Box, Terrain
 
 Array = np.ndarray
+_NARROWEST = 0.7  # of the distance of hips: nearer, feet get in each other's way
 _LEVEL = 0.5  # rad, a body tilted less stands as usual
 
 
@@ -28,9 +29,9 @@ def footprint(xy: Array, base: Array, trunk: Trunk, standing: Array, body: Robot
     """Stance width and length of the robot, strides of the creature, shortened where legs would not reach.
 
     Each sole is shifted by a constant in the heading frame: a paw so that its median stance place lies under the
-    robot's hip, a foot sideways only as far as keeps it from the other one (a person's stance opens and closes). A sole
-    that never stands while the body is level keeps its place along the body. One factor on the path of body and soles
-    alike keeps standing soles standing.
+    robot's hip, or as far inside as the creature's; a foot sideways only as far as keeps it from the other one (a
+    person's stance opens and closes). A sole that never stands while the body is level keeps its place along the body.
+    One factor on the path of body and soles alike keeps standing soles standing.
 
     Args:
         xy: (T, S, 2), base: (T, 2) m, in the robot's size.  standing: (T, S) bool.
@@ -44,9 +45,11 @@ def footprint(xy: Array, base: Array, trunk: Trunk, standing: Array, body: Robot
         on = level[:, f] if level[:, f].any() else standing[:, f]
         stances = x[on] if on.any() else x
         centre[f] = np.median(stances, axis=0)
+        side, width = np.sign(home[f, 1]), abs(home[f, 1])
         if body.length:
-            side = np.sign(home[f, 1])
-            centre[f, 1] = side * min(np.percentile(side * stances[:, 1], 10), abs(home[f, 1]))
+            centre[f, 1] = side * np.percentile(side * stances[:, 1], 10)
+        # As narrow as the creature stands, as far as the robot can: the wider the stance, the more a body must sway.
+        home[f, 1] = side * np.clip(side * centre[f, 1], _NARROWEST * width, np.inf if body.length else width)
     free = ~level.any(axis=0)
     used = ~free if not free.all() else standing.any(axis=0) | free
     away = np.linalg.norm(relative - centre, axis=2)[:, used]
