@@ -10,6 +10,7 @@ from slomo.optimize import constraints, cost, dynamics, so3
 from slomo.optimize.dynamics import Body
 from slomo.optimize.fatrop import smooth_step
 from slomo.pointfoot import PointFootModel
+from slomo.robot_workspace import directions
 
 HIPS = np.array([[0.19, 0.13, 0], [0.19, -0.13, 0], [-0.19, 0.13, 0], [-0.19, -0.13, 0]])
 PELVIS = np.array(
@@ -26,6 +27,7 @@ def make_model(C: int) -> PointFootModel:
         foot_mass=np.linspace(0.3, 0.6, C), u_max=np.full((C, 3), 400.0), names=tuple(f"leg{c}" for c in range(C)),
         pairs=[[0, 1], [2, 3]] if human else np.zeros((0, 2), int), pair_length=[0.2, 0.21] if human else np.zeros(0),
         leg_roots=(PELVIS if human else HIPS) + [0.02, 0.01, -0.03],
+        workspace=np.where(np.arange(C)[:, None] == 1, np.linspace(0.1, 0.6, len(directions())), np.inf),
         clearance=[0.2, 0.2, 0.2, 0.2, -np.inf, -np.inf] if human else np.full(C, 0.05),
     )  # fmt: skip
 
@@ -182,9 +184,13 @@ def test_limits_are_the_constraints(C):
         held = np.flatnonzero(np.isfinite(model.clearance))
         at = C + len(held)
         assert np.allclose(g[2 * C + held], low[C:at] - got[C:at])
-        P = len(model.pairs)
+        P, K = len(model.pairs), len(directions())
+        room = np.argwhere(np.isfinite(model.workspace))
+        beyond = got[at : at + len(room)] - high[at : at + len(room)]
+        assert np.allclose(g[3 * C + 3 * P + room[:, 0] * K + room[:, 1]], beyond)
+        at += len(room)
         assert len(got) == at + 2 * P
         assert np.allclose(g[3 * C : 3 * C + P], np.sqrt(got[at::2]) - np.sqrt(low[at::2]) - cm.PAIR_TOLERANCE)
         assert np.allclose(np.sqrt(high[at::2]) - np.sqrt(low[at::2]), 2 * cm.PAIR_TOLERANCE)
         assert np.allclose(g[3 * C + P : 3 * C + 2 * P], got[at + 1 :: 2] - high[at + 1 :: 2])
-        assert np.allclose(g[3 * C + 2 * P :], low[at + 1 :: 2] - got[at + 1 :: 2])
+        assert np.allclose(g[3 * C + 2 * P : 3 * C + 3 * P], low[at + 1 :: 2] - got[at + 1 :: 2])
