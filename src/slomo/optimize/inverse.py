@@ -6,10 +6,10 @@ put every contact frame on its point, the one nearest to a home,
     min |S (q - q_home)|^2   such that   p_c(q) = f_c,   lower <= q <= upper,
 
 by Gauss-Newton steps, damped by the error's own size (Sugihara, "Solvability-unconcerned inverse kinematics by the
-Levenberg-Marquardt method", 2011), with joints held at a limit that they would cross. S makes joints that move heavy
-parts dear, so that an arm is used before the trunk. Where joints are redundant, home is a little of the way from the
-last knot's angles to the nominal ones, and in a second pass the first one's, smoothed in time; and no joint turns faster
-than it can.
+Levenberg-Marquardt method", 2011), with joints held at a limit that they would cross. S makes joints dear that move
+heavy parts or several limbs, or that are slow, so that an arm is used before the trunk. Where joints are redundant,
+home is a little of the way from the last knot's angles to the nominal ones, and in a second pass the first one's,
+smoothed in time.
 
 Inverse dynamics, of each step: the recursive Newton-Euler algorithm (Featherstone 2008, section 5.3) with the step's
 contact forces at the contact frames and the accelerations of the reference's own integrator, a = (v_next - v) / h. It
@@ -35,7 +35,6 @@ STILL = 1e-4  # rad, a step after which the iteration ends
 ITERATIONS = 30
 PULL = np.minimum(1.0, 0.7 ** (np.arange(ITERATIONS) - 8))  # home gives way at last: with limits it can go in circles
 RETURN = 0.5  # s in which redundant joints come back to their nominal angles
-FASTEST = 0.95  # of a joint's speed limit, where others can help it
 SMOOTHING = 0.3  # s, of the redundant joints' home in the second pass
 
 
@@ -75,13 +74,10 @@ def joint_motion(robot: Robot, reference: Reference) -> JointMotion:
     q[:, :7], v[:, :6] = root[:, :7], root[:, 7:]
     nominal = np.tile(robot.q_nominal[7:], (T, 1))
     keep = np.exp(-np.concatenate([[np.inf], r.h]) / RETURN)
-    redundant = nj > len(legs.error)
-    rate = FASTEST * robot.velocity if redundant else np.full(nj, np.inf)
-    change = np.vstack([np.full(nj, np.inf), r.h[:, None] * rate])
-    q[:, 7:], error = legs.sweep(root[:, :7], r.points, nominal, keep, change)
-    if redundant:
+    q[:, 7:], error = legs.sweep(root[:, :7], r.points, nominal, keep)
+    if nj > len(legs.error):
         home = gaussian_filter1d(q[:, 7:], SMOOTHING * (T - 1) / (r.t[-1] - r.t[0]), axis=0, mode="nearest")
-        q[:, 7:], error = legs.sweep(root[:, :7], r.points, home, np.zeros(T), change)
+        q[:, 7:], error = legs.sweep(root[:, :7], r.points, home, np.zeros(T))
     v[1:, 6:] = np.diff(q[:, 7:], axis=0) / r.h[:, None]
     v[0, 6:] = legs.velocities(q[0], v[0, :6], v[1, 6:], r.v[0, 6:])
 
@@ -116,7 +112,10 @@ class _Legs:
             across = np.cross([0.0, 0.0, 1.0], along)
             self._flat.append((joint, self.data.oMi[joint].rotation.T @ across / np.linalg.norm(across)))
         inertia = np.diag(pin.crba(self.model, self.data, robot.q_nominal))[6:]
-        self._scale = np.maximum(1.0, inertia / np.median(inertia))
+        chains = [self.model.supports[j] for j in {self.model.frames[f].parentJoint for f in self.points}]
+        limbs = [sum(j in chain for chain in chains) for j in range(2, self.model.njoints)]
+        heavy = np.maximum(1.0, np.sqrt(inertia / np.median(inertia))) * np.maximum(1, limbs)
+        self._scale = heavy * np.median(robot.velocity) / robot.velocity
         self.error = np.zeros(3 * len(self.points) + len(self._flat))
 
     def root(self, q: Array, v: Array) -> Array:
@@ -158,26 +157,22 @@ class _Legs:
             out[3 * len(self.points) + i] = -FLAT * (self.data.oMi[joint].rotation[2] @ axis)
         return out
 
-    def sweep(self, root: Array, points: Array, home: Array, keep: Array, change: Array) -> tuple[Array, Array]:
+    def sweep(self, root: Array, points: Array, home: Array, keep: Array) -> tuple[Array, Array]:
         """`solve` at every knot, each from the one before: joints (T, nj) rad and what is missing (T, C, 3) m.
 
         Args:
             home: (T, nj) rad.  keep: (T,) share of the last knot's angles in the home of each.
-            change: (T, nj) rad, most that joints may turn since the last knot.
         """
         joints, error = np.empty(home.shape), np.empty(points.shape)
         last = home[0]
         for k in range(len(root)):
-            lower = np.maximum(self.robot.lower, last - change[k])
-            upper = np.minimum(self.robot.upper, last + change[k])
-            aim = keep[k] * last + (1 - keep[k]) * home[k]
-            last = joints[k] = self.solve(root[k], last, points[k], aim, lower, upper)
+            last = joints[k] = self.solve(root[k], last, points[k], keep[k] * last + (1 - keep[k]) * home[k])
             error[k] = self.error[: points[k].size].reshape(-1, 3)
         return joints, error
 
-    def solve(self, root: Array, joints: Array, points: Array, home: Array, lower: Array, upper: Array) -> Array:
+    def solve(self, root: Array, joints: Array, points: Array, home: Array) -> Array:
         """(nj,) rad that bring the contact frames to points (C, 3), from a first guess, with the root at (7,)."""
-        scale = self._scale
+        lower, upper, scale = self.robot.lower, self.robot.upper, self._scale
         q = np.concatenate([root, joints])
         for i in range(ITERATIONS):
             J = self.jacobian(q)[:, 6:] / scale
