@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from slomo.errors import InvalidData
 from slomo.motion import Reference, WholeBody
-from slomo.optimize.verify import dynamics_defect
+from slomo.optimize.verify import cycle_gap, dynamics_defect
 from slomo.optimize.whole_body import Settings, refine
 from slomo.optimize.whole_body_model import WholeBodyModel, minus, plus
 from slomo.optimize.whole_body_verify import point_foot_reference, verify_whole_body
@@ -229,3 +229,21 @@ def test_the_verifier_catches(trot, check, name, index, value):
 def test_a_motion_of_another_robot_is_refused(trot):
     with pytest.raises(InvalidData, match="another robot"):
         verify_whole_body(ROBOT, replace(trot.motion, robot_digest="other"), terrain=FLAT, mu=0.6)
+
+
+def test_a_cycle_closes():
+    """One stride forwards, and one that turns: the end is the start, carried on, of robot and point-foot view."""
+    open_ended = trotting(T=9)
+    turn, speed = 0.2, 0.3 * 0.4
+    cycle = np.array([speed, 0.0, 0.0, 0.0])
+    out = refine(ROBOT, replace(open_ended, cycle=cycle), terrain=FLAT, mu=0.6)
+    checks = verify_whole_body(ROBOT, out.motion, terrain=FLAT, mu=0.6)
+    assert out.status == "converged"
+    assert all(c.holds for c in checks.values()), {n: c for n, c in checks.items() if not c.holds}
+    assert checks["cycle_gap"].value < 1e-6
+    assert cycle_gap(point_foot_reference(ROBOT, MODEL, out.motion)).max() < 1e-6
+    turned = refine(ROBOT, replace(open_ended, cycle=np.append(cycle[:3], turn)), terrain=FLAT, mu=0.6)
+    assert verify_whole_body(ROBOT, turned.motion, terrain=FLAT, mu=0.6)["cycle_gap"].holds
+    q = turned.motion.q.copy()
+    q[-1, 0] += 1e-4
+    assert not verify_whole_body(ROBOT, replace(turned.motion, q=q), terrain=FLAT, mu=0.6)["cycle_gap"].holds

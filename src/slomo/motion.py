@@ -210,6 +210,7 @@ class WholeBody(_Arrays):
         tau: (T-1, nj) N m.
         lam: (T-1, C, 3) N, world: contact force of the ground on each point.
         point_names: C names.  joint_names: nj names.  robot_digest: digest of the robot for which it was made.
+        cycle: as of a `Reference`.
     """
 
     t: Array
@@ -221,10 +222,13 @@ class WholeBody(_Arrays):
     point_names: tuple[str, ...]
     joint_names: tuple[str, ...]
     robot_digest: str
+    cycle: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self):
         T, C, nj = len(self.t), len(self.point_names), len(self.joint_names)
         _times(self.t)
+        _shape("cycle", self.cycle, (4,) if len(self.cycle) else (0,))
+        _finite("cycle", self.cycle)
         shapes = dict(h=(T - 1,), q=(T, 7 + nj), v=(T, 6 + nj), tau=(T - 1, nj), lam=(T - 1, C, 3))
         for name, shape in shapes.items():
             _shape(name, getattr(self, name), shape)

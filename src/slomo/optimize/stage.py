@@ -153,8 +153,6 @@ def _check(config: Config) -> None:
         )
     if config.model not in MODELS:
         raise UsageError(f"no model {config.model!r}", where="optimize.model", valid=MODELS)
-    if config.model != "point-foot" and config.cyclic:
-        raise UsageError("a cycle closes for the point-foot model only", where="optimize.cyclic")
     if config.solver not in SOLVERS:
         raise UsageError(f"no solver {config.solver!r}", where="optimize.solver", valid=tuple(SOLVERS))
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from slomo.motion import Reference, WholeBody
 from slomo.optimize.inverse import joint_motion
-from slomo.optimize.whole_body_model import WholeBodyModel, plus
+from slomo.optimize.whole_body_model import WholeBodyModel, carried, plus
 from slomo.optimize.whole_body_problem import Point, Problem, Weights
 from slomo.optimize.whole_body_qp import Limits, Penalties, Program
 from slomo.robot import Robot
@@ -64,7 +64,7 @@ class Refined:
 
 
 # What counts as satisfied, in the units of `Violations`: N and N m, parts of a limit (within the margin), m, N m.
-_SATISFIED = Penalties(base=5e-7, torque=5e-4, speed=5e-4, depth=1e-5, contact=2e-5, slide=5e-5)
+_SATISFIED = Penalties(base=5e-7, torque=5e-4, speed=5e-4, depth=1e-5, contact=2e-5, slide=5e-5, cycle=1e-8)
 # Share of the cost below which the price of what is violated is left to closing.
 _NEARLY = 0.03
 # Of the cost, in relative tolerances: a millimetre off for two seconds.
@@ -104,7 +104,7 @@ def refine(
         status = f"not all equations can be closed: {', '.join(lacking)}"
     motion = WholeBody(
         t=reference.t, h=reference.h, q=x.q[1:], v=x.steps.v, tau=x.tau, lam=x.lam, point_names=robot.foot_names,
-        joint_names=robot.joint_names, robot_digest=robot.digest,
+        joint_names=robot.joint_names, robot_digest=robot.digest, cycle=reference.cycle,
     )  # fmt: skip
     return Refined(motion, status, iterations + more, x.cost, time.perf_counter() - began)
 
@@ -113,6 +113,10 @@ def start(robot: Robot, reference: Reference) -> Array:
     """Knots (T + 1, nq) by inverse kinematics; the first is the one before the motion, for its first velocity."""
     motion = joint_motion(robot, reference)
     q = motion.q
+    if len(reference.cycle):
+        turn = reference.cycle[3]
+        back = Rotation.from_euler("z", -turn).apply(-reference.cycle[:3])
+        return np.concatenate([carried(q[-2:-1], np.append(back, -turn)), q])
     v = motion.v[0].copy()
     v[:3] = Rotation.from_quat(q[0, 3:7]).apply(v[:3])
     return np.concatenate([plus(q[0], -reference.h[0] * v)[None], q])

@@ -34,6 +34,13 @@ def minus(q1: Array, q0: Array) -> Array:
     return np.concatenate([q1[..., :3] - q0[..., :3], turn, q1[..., 7:] - q0[..., 7:]], axis=-1)
 
 
+def carried(q: Array, cycle: Array) -> Array:
+    """Configurations (..., 7 + nj) after one cycle: turned about z and moved by a `Reference.cycle` (4,)."""
+    turn = Rotation.from_euler("z", cycle[3])
+    place = q[..., :3] @ turn.as_matrix().T + cycle[:3]
+    return np.concatenate([place, (turn * Rotation.from_quat(q[..., 3:7])).as_quat(), q[..., 7:]], axis=-1)
+
+
 def skew(x: Array) -> Array:
     """(..., 3) to the matrices (..., 3, 3) of the cross product from the left."""
     out = np.zeros((*x.shape, 3))

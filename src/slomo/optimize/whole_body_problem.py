@@ -4,9 +4,10 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.spatial.transform import Rotation
 
 from slomo.motion import Reference
-from slomo.optimize.whole_body_model import Kinematics, Steps, WholeBodyModel, minus, right_jacobian_inverse
+from slomo.optimize.whole_body_model import Kinematics, Steps, WholeBodyModel, carried, minus, right_jacobian_inverse
 from slomo.optimize.whole_body_qp import Layout, Limits, Linearized, Penalties
 from slomo.terrain import Terrain
 
@@ -40,7 +41,7 @@ class Violations:
 
     Attributes:
         base: (K, 6) N, N m.  torque, speed: (K,) over the limit, as a part of it.  depth: (T, C) m.
-        contact, slide: (K, C) N m.
+        contact, slide: (K, C) N m.  cycle: (2 or 0, nv) m and rad.
     """
 
     base: Array
@@ -49,10 +50,11 @@ class Violations:
     depth: Array
     contact: Array
     slide: Array
+    cycle: Array
 
     def beyond(self, allowed: Penalties) -> list[str]:
         """Names of what is more than allowed anywhere."""
-        return [f.name for f in fields(self) if getattr(self, f.name).max() > getattr(allowed, f.name)]
+        return [f.name for f in fields(self) if getattr(self, f.name).max(initial=0.0) > getattr(allowed, f.name)]
 
     def price(self, penalties: Penalties) -> float:
         return float(sum(p * getattr(self, f.name).sum() for p, f in zip(penalties, fields(self), strict=True)))
@@ -99,9 +101,11 @@ class Problem:
     ):
         self.model, self.terrain, self.limits, self.weights = model, terrain, limits, weights
         self.reference, self.start = reference, start
-        self.h = np.concatenate([reference.h[:1], reference.h])
+        # In a cycle, what leads to the first knot is what leads to the last.
+        self.cyclic = len(reference.cycle) > 0
+        self.h = np.concatenate([reference.h[-1:] if self.cyclic else reference.h[:1], reference.h])
         self.base = reference.q[:, :7]
-        self.layout = Layout(len(reference.t), *model.structure())
+        self.layout = Layout(len(reference.t), *model.structure(), cyclic=self.cyclic)
         # Of the damping, for steps of 1 rad or m and of 300 N.
         self.scale = np.zeros(self.layout.n)
         self.scale[self.layout.dq], self.scale[self.layout.lam] = 1.0, 1e-5
@@ -137,6 +141,7 @@ class Problem:
             depth=over(-gap, 0.0),
             contact=over(over(gap[1:], 0.0) * load - limits.kappa, 0.0),
             slide=over(np.max(np.abs(slide), axis=2) * load - limits.kappa_slide, 0.0),
+            cycle=np.abs(self._closing(q)),
         )
         return Point(q, lam, kin, steps, tau, frames, gap, load, slide, float(cost), violations)
 
@@ -144,6 +149,12 @@ class Problem:
         """(K, 3 + nj): of the root, less the start's, m/s^2; of the joints, rad/s^2."""
         x, c = np.concatenate([q[:, :3] - self.start[:, :3], q[:, 7:]], axis=1), self.bend[:, :, None]
         return c[:, 0] * x[:-2] + c[:, 1] * x[1:-1] + c[:, 2] * x[2:]
+
+    def _closing(self, q: Array) -> Array:
+        """(2, nv) tangents from where a cycle's last two knots should be to where they are, or (0, nv)."""
+        if not self.cyclic:
+            return np.zeros((0, self.layout.nv))
+        return minus(q[-2:], carried(q[:2], self.reference.cycle))
 
     def _acceleration_weights(self, w: Weights) -> Array:
         return np.repeat([w.base_acceleration, w.joint_acceleration], [3, self.layout.nj])
@@ -181,15 +192,22 @@ class Problem:
         P = sp.csc_matrix((values, (rows, cols)), shape=(layout.n, layout.n))
         now = np.zeros(layout.n)
         now[layout.lam], now[layout.tau] = x.lam, x.tau
-        lack = x.steps.residual(x.lam)[:, :6]
-        now[layout.s_base] = np.stack([np.maximum(lack, 0.0), np.maximum(-lack, 0.0)], axis=-1)
-        for columns, f in zip(layout.slacks[1:], fields(Violations)[1:], strict=True):
+        closing = self._closing(x.q)
+        for columns, f in zip(layout.slacks[1:-1], fields(Violations)[1:-1], strict=True):
             now[columns] = getattr(x.violations, f.name)
+        for columns, lack in ((layout.s_base, x.steps.residual(x.lam)[:, :6]), (layout.s_cycle, closing)):
+            now[columns] = np.stack([np.maximum(lack, 0.0), np.maximum(-lack, 0.0)], axis=-1)
+        by_end = np.tile(np.eye(layout.nv), (len(closing), 1, 1))
+        by_end[:, 3:6, 3:6] = right_jacobian_inverse(closing[:, 3:6])
+        by_start = -np.swapaxes(by_end, 1, 2)
+        if self.cyclic:
+            by_start[:, :3, :3] = -Rotation.from_euler("z", self.reference.cycle[3]).as_matrix()
         s = x.steps
         assert s.D is not None
         return Linearized(
             h=h, v=s.v, q_joints=x.q[1:, 7:], force=s.force, Jt=s.Jt, D=s.D, J=x.kinematics.J, frames=x.frames,
-            gap=x.gap, lam=x.lam, load=x.load, slide=x.slide, P=P, gradient=gradient, now=now,
+            gap=x.gap, closing=closing, by_start=by_start, by_end=by_end, lam=x.lam, load=x.load, slide=x.slide,
+            P=P, gradient=gradient, now=now,
         )  # fmt: skip
 
 

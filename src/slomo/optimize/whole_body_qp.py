@@ -26,6 +26,8 @@ class Linearized(NamedTuple):
         force: (K, nv), Jt: (K, nv, 3 C), D: (K, 3, nv, nv) as in `whole_body_model.Steps`.
         J: (T, C, 3, nv) of the points.
         frames: (T, C, 3, 3) rows: two tangents and the normal of the ground under each point.  gap: (T, C) m.
+        closing: (2, nv) by how much the ends of a cycle do not meet, or (0, nv).
+        by_start, by_end: (2 or 0, nv, nv) its derivatives by the first two knots and by the last two.
         lam: (K, C, 3) N.  load: (K, C) N, its normal part.  slide: (K, C, 2) m, tangential way of a point in a step.
         P: sparse (n, n), gradient: (n,): the cost's, over `Layout`'s unknowns.  now: (n,) their values as it is.
     """
@@ -42,6 +44,9 @@ class Linearized(NamedTuple):
     lam: Array
     load: Array
     slide: Array
+    closing: Array
+    by_start: Array
+    by_end: Array
     P: sp.csc_matrix
     gradient: Array
     now: Array
@@ -61,7 +66,7 @@ class Limits(NamedTuple):
 
 class Penalties(NamedTuple):
     """Price of a slack: base force or torque (1/N, 1/N m), torque and speed as a part of their limit, depth (1/m),
-    gap x force and slide x force (1/N m)."""
+    gap x force and slide x force (1/N m), ends of a cycle that do not meet (1/m, 1/rad)."""
 
     base: float = 0.1
     torque: float = 100.0
@@ -69,12 +74,13 @@ class Penalties(NamedTuple):
     depth: float = 1e3
     contact: float = 100.0
     slide: float = 100.0
+    cycle: float = 100.0
 
 
 class Layout:
     """Columns of the unknowns, each an array of column numbers."""
 
-    def __init__(self, T: int, coupled: Array, moved: Array):
+    def __init__(self, T: int, coupled: Array, moved: Array, *, cyclic: bool):
         """Of T knots; coupled (nv, nv) and moved (C, nv) as of `WholeBodyModel.structure`."""
         self.coupled, self.moved = coupled, moved
         C, nj = len(moved), len(coupled) - 6
@@ -91,8 +97,17 @@ class Layout:
         self.s_depth = self._take(T, C)
         self.s_contact = self._take(self.K, C)
         self.s_slide = self._take(self.K, C)
+        self.s_cycle = self._take(2 if cyclic else 0, self.nv, 2)
         self.slack = np.arange(first, self.n)
-        self.slacks = (self.s_base, self.s_torque, self.s_speed, self.s_depth, self.s_contact, self.s_slide)
+        self.slacks = (
+            self.s_base,
+            self.s_torque,
+            self.s_speed,
+            self.s_depth,
+            self.s_contact,
+            self.s_slide,
+            self.s_cycle,
+        )
 
     def _take(self, *shape: int) -> Array:
         size = int(np.prod(shape))
@@ -183,7 +198,7 @@ class Program:
 
     def _rows(self, x: Linearized) -> tuple[sp.csc_matrix, Array, int, int]:
         layout, limits, rows = self.layout, self.limits, _Rows()
-        K, C, nj = layout.K, layout.C, layout.nj
+        K, C, nj, nv = layout.K, layout.C, layout.nj, layout.nv
         one = np.ones((1, 1))
         # Dynamics: force + D dq - Jt lam = (slack, tau).
         knots = np.concatenate([layout.dq[:-2], layout.dq[1:-1], layout.dq[2:]], axis=1)
@@ -197,6 +212,11 @@ class Program:
                  (layout.tau, -own, own != 0))  # fmt: skip
         rows.add(np.zeros((K + 1, C, 3)), (layout.dp, axis, axis != 0),
                  (layout.dq[1:, None], -x.J, layout.moved[:, None]))  # fmt: skip
+        n = len(x.closing)
+        slack, own = np.kron(np.eye(nv), [[1.0, -1.0]]), np.eye(nv) > 0
+        own[3:6, 3:6] = own[:3, :3] = True
+        rows.add(-x.closing, (layout.dq[:n], x.by_start, own), (layout.dq[-2:][:n], x.by_end, own),
+                 (layout.s_cycle.reshape(n, 2 * nv), -slack, slack != 0))  # fmt: skip
         equations = rows.count
         # Limits of the joints.
         q, dq = x.q_joints, layout.dq[..., 6:, None]

@@ -19,7 +19,7 @@ from slomo.terrain import Terrain
 
 Array = np.ndarray
 
-_WORLD, _LOCAL = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED, pin.ReferenceFrame.LOCAL
+_WORLD = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 
 def verify_whole_body(robot: Robot, motion: WholeBody, *, terrain: Terrain, mu: float) -> dict[str, Check]:
@@ -29,7 +29,7 @@ def verify_whole_body(robot: Robot, motion: WholeBody, *, terrain: Terrain, mu: 
         the time axis.
     Those of `ground_checks`, at the contact frames by forward kinematics.
     torque_ratio, speed_ratio: |joint torque|, |joint velocity| over the URDF's limits.
-    joint_range: rad beyond a joint's range.
+    joint_range: rad beyond a joint's range.  cycle_gap: m, rad, m/s and rad/s by which the ends of a cycle do not meet.
 
     Raises:
         InvalidData: the motion was made for another robot.
@@ -43,13 +43,26 @@ def verify_whole_body(robot: Robot, motion: WholeBody, *, terrain: Terrain, mu: 
     data = robot.model.createData()
     points = np.array([_points(robot, data, q) for q in m.q])
     s = m.q[:, 7:]
-    return {
+    checks = {
         "dynamics_residual": worst(_defect(robot, m), 1e-6, "", m.t[1:], parts),
         **ground_checks(m.t, points, m.lam, terrain=terrain, mu=mu, names=robot.limb_names),
         "torque_ratio": worst(np.abs(m.tau) / robot.effort, 1.0, "", m.t[:-1], joints),
         "speed_ratio": worst(np.abs(m.v[1:, 6:]) / robot.velocity, 1.0, "", m.t[1:], joints),
         "joint_range": worst(np.maximum(s - robot.upper, robot.lower - s).clip(0.0), 1e-6, "rad", m.t, joints),
     }
+    if len(m.cycle):
+        checks["cycle_gap"] = worst(_cycle_gap(m), 1e-6, "", m.t[-1:], parts[:-1])
+    return checks
+
+
+def _cycle_gap(m: WholeBody) -> Array:
+    """(1, 3 + nj) how far the last state is from the first one, turned about z and moved by `cycle`."""
+    turn, (q0, q1), (v0, v1) = Rotation.from_euler("z", m.cycle[3]), m.q[[0, -1]], m.v[[0, -1]]
+    place = np.abs(q1[:3] - turn.apply(q0[:3]) - m.cycle[:3]).max()
+    rotation = ((turn * Rotation.from_quat(q0[3:7])).inv() * Rotation.from_quat(q1[3:7])).magnitude()
+    speed = np.abs(np.concatenate([v1[:3] - turn.apply(v0[:3]), v1[3:6] - v0[3:6]])).max()
+    joints = np.maximum(np.abs(q1[7:] - q0[7:]), np.abs(v1[6:] - v0[6:]))
+    return np.concatenate([[place, rotation, speed], joints])[None]
 
 
 def _points(robot: Robot, data: pin.Data, q: Array) -> Array:
@@ -103,30 +116,33 @@ def point_foot_reference(robot: Robot, model: PointFootModel, motion: WholeBody)
     own equation m_c f'' = -u + m_c g + lam exact. The equations of the body hold only as far as the robot resembles the
     model (its limbs have mass and move), and the model's limits on u and leg length were not asked for.
     """
-    m, h = motion, motion.h[:, None]
-    data, base = robot.model.createData(), robot.model.getFrameId(robot.base)
+    m, data, base = motion, robot.model.createData(), robot.model.getFrameId(robot.base)
     T, C = len(m.t), len(robot.foot_names)
-    points, poses = np.empty((T, C, 3)), np.empty((T, 7))
-    for k, q in enumerate(m.q):
+    # With the knot before the first, from which its velocity comes, by a step like the first or, of a cycle, the last.
+    h = np.concatenate([m.h[-1:] if len(m.cycle) else m.h[:1], m.h])[:, None]
+    before = np.concatenate(
+        [
+            m.q[0, :3] - h[0] * m.v[0, :3],
+            (Rotation.from_quat(m.q[0, 3:7]) * Rotation.from_rotvec(-h[0] * m.v[0, 3:6])).as_quat(),
+            m.q[0, 7:] - h[0] * m.v[0, 6:],
+        ]
+    )
+    points, poses = np.empty((T + 1, C, 3)), np.empty((T + 1, 7))
+    for k, q in enumerate(np.vstack([before, m.q])):
         points[k] = _points(robot, data, q)
         poses[k] = pin.SE3ToXYZQUAT(data.oMf[base])
-    v = np.zeros((T, 6 + 3 * C))
     R = Rotation.from_quat(poses[:, 3:7])
-    v[1:, :3] = np.diff(poses[:, :3], axis=0) / h
-    v[1:, 3:6] = (R[:-1].inv() * R[1:]).as_rotvec() / h
-    v[1:, 6:] = (np.diff(points, axis=0) / h[..., None]).reshape(T - 1, -1)
-    spatial = m.v[0].copy()
-    spatial[:3] = Rotation.from_quat(m.q[0, 3:7]).inv().apply(spatial[:3])
-    pin.computeJointJacobians(robot.model, data, m.q[0])
-    pin.updateFramePlacements(robot.model, data)
-    v[0, :3] = pin.getFrameJacobian(robot.model, data, base, _WORLD)[:3] @ spatial
-    v[0, 3:6] = pin.getFrameJacobian(robot.model, data, base, _LOCAL)[3:] @ spatial
-    for c, name in enumerate(robot.foot_names):
-        f = robot.model.getFrameId(name)
-        v[0, 6 + 3 * c : 9 + 3 * c] = pin.getFrameJacobian(robot.model, data, f, _WORLD)[:3] @ spatial
-    acceleration = (np.diff(v[:, 6:], axis=0) / h).reshape(T - 1, C, 3)
+    v = np.concatenate(
+        [
+            np.diff(poses[:, :3], axis=0) / h,
+            (R[:-1].inv() * R[1:]).as_rotvec() / h,
+            (np.diff(points, axis=0) / h[..., None]).reshape(T, -1),
+        ],
+        axis=1,
+    )
+    acceleration = (np.diff(v[:, 6:], axis=0) / h[1:]).reshape(T - 1, C, 3)
     u = m.lam - model.foot_mass[:, None] * (acceleration + [0.0, 0.0, model.g])
     return Reference(
-        t=m.t, h=m.h, q=np.concatenate([poses, points.reshape(T, -1)], axis=1), v=v, u=u.reshape(T - 1, -1), lam=m.lam,
-        point_names=robot.foot_names, robot_digest=robot.digest,
+        t=m.t, h=m.h, q=np.concatenate([poses, points.reshape(T + 1, -1)], axis=1)[1:], v=v, u=u.reshape(T - 1, -1),
+        lam=m.lam, point_names=robot.foot_names, robot_digest=robot.digest, cycle=m.cycle,
     )  # fmt: skip
