@@ -39,6 +39,7 @@ SOLVERS = {
 }
 ATTEMPTS = 9
 _MISSED, _MARGIN = 1e-3, 1.3  # m from which on a miss counts, and by what factor of it a leg is made shorter
+_WEAKER, _SLOWER = 2, 1.15  # attempts with limited forces before the motion is slowed down, and by what each time
 _TIGHTER = 0.9  # of the force that would keep a joint just within its torque limit
 
 
@@ -122,7 +123,7 @@ def make_plan(
         # From the solution with fixed steps: it is a point of this problem, so that freedom cannot make it worse.
         task, it = make_task(want, wish.steps), solution.iterate
         solution = solve(task, it._replace(us=np.column_stack([it.us, task.u_ref[:, -1]])))
-    settings, why, best = wish.settings, "targets", None
+    settings, why, best, overloaded = wish.settings, "targets", None, 0
     while True:
         attempts.append(f"{why}: {solution.status}, start {solution.start!r}, {solution.iterations} steps")
         reference = _reference(robot, model, task, solution)
@@ -134,14 +135,28 @@ def make_plan(
             best = badness, reference, checks, solution
         if wish.solver != "ddp" or len(attempts) >= ATTEMPTS or not wrong:
             break
+        remedies = []
         if "slip_per_second" in wrong and not settings.strict:
-            settings, why = replace(settings, strict=True), "loaded feet made to stick"
-        elif "torque_ratio" in wrong:
-            task, why = _limit_forces(robot, reference, task), "forces limited where joints were overloaded"
-        elif "joint_miss" in wrong:
-            legs, why = _less_room(robot, reference, legs), "less room where joint limits kept a point back"
-        else:
+            settings = replace(settings, strict=True)
+            remedies.append("loaded feet made to stick")
+        if "joint_miss" in wrong:
+            legs = _less_room(robot, reference, legs)
+            remedies.append("less room where joint limits kept a point back")
+        if wrong & {"torque_ratio", "speed_ratio"}:
+            overloaded += 1
+            task = _limit_forces(robot, reference, task)
+            remedies.append("forces limited where joints were overloaded")
+            if overloaded > _WEAKER and not wish.cyclic:
+                # Forces alone do not help: it is the motion that asks too much.
+                slower = _SLOWER ** (overloaded - _WEAKER)
+                slow = make_task(replace(want, t=slower * want.t, v=want.v / slower), wish.steps)
+                task = slow._replace(ground=task.ground, u_low=task.u_low, u_high=task.u_high)
+                if wish.steps is not None:
+                    task.u_low[:, -1], task.u_high[:, -1] = slow.u_low[:, -1], slow.u_high[:, -1]
+                remedies.append(f"the motion slowed down to {100 / slower:.0f} %")
+        if not remedies:
             break
+        why = " and ".join(remedies)
         report(0.0, why)
         solution = solve(task, solution.iterate, settings)
     _, reference, checks, solution = best

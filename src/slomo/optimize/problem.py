@@ -24,8 +24,8 @@ class Weights:
     Attributes:
         position: 1/m^2, body.  orientation: 1/rad^2.  foot: 1/m^2, horizontal.  foot_height: 1/m^2.
         velocity: s^2/m^2, of the body.  angular_velocity: s^2/rad^2.  foot_velocity: s^2/m^2.
-        effort: 1/N^2.  acceleration: s^4/m^2, of the body.
-        slip: s^2/m^2.  slip_load: N, normal force from which slip counts half.
+        effort: of forces as shares of the robot's weight.  acceleration: s^4/m^2, of the body.
+        slip: s^2/m^2.  slip_load: share of the robot's weight, normal force from which slip counts half.
     """
 
     position: float = 1000.0
@@ -35,10 +35,10 @@ class Weights:
     velocity: float = 1.0
     angular_velocity: float = 0.5
     foot_velocity: float = 0.3
-    effort: float = 1e-4
+    effort: float = 1.65
     acceleration: float = 0.05
     slip: float = 1000.0
-    slip_load: float = 2.0
+    slip_load: float = 0.0156
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,8 @@ def make_task(
     w_x[:, nv + 6 :] = weights.foot_velocity
     h = np.diff(want.t)
     u_high = np.tile(model.u_max.ravel(), (T - 1, 1))
-    u_low, u_ref, w_u = -u_high, np.zeros((T - 1, 3 * C)), np.full((T - 1, 3 * C), weights.effort)
+    weight = model.total_mass * model.g
+    u_low, u_ref, w_u = -u_high, np.zeros((T - 1, 3 * C)), np.full((T - 1, 3 * C), weights.effort / weight**2)
     if steps is not None:
         u_low, u_high = np.column_stack([u_low, steps.shortest * h]), np.column_stack([u_high, steps.longest * h])
         u_ref, w_u = np.column_stack([u_ref, h]), np.column_stack([w_u, steps.weight / h**2])
@@ -164,7 +165,7 @@ def make_task(
         u_high=u_high,
         w_acceleration=weights.acceleration,
         w_slip=weights.slip,
-        slip_load=weights.slip_load,
+        slip_load=weights.slip_load * weight,
         cyclic=False,
         shift=np.zeros(4),
     )

@@ -38,6 +38,7 @@ class Settings:
         constraint_tolerance: m, largest violation accepted.  cone_tolerance: N, the same of a friction cone.
         end_tolerance: m, rad, m/s, rad/s, of the end of a cyclic motion.
         rounds: of the augmented Lagrangian (and of moving the ground) at the last kappa.
+        most_iterations: in all, from one start.
         strict: whether loaded points may not slide at all, instead of at a cost.
         starts: most starts that are tried.
     """
@@ -51,6 +52,7 @@ class Settings:
     cone_tolerance: float = 1e-3
     end_tolerance: float = 5e-7
     rounds: int = 16
+    most_iterations: int = 1500
     strict: bool = False
     starts: int = 4
 
@@ -221,6 +223,9 @@ def _descend(
             if moved:
                 failure = failure or "feet keep crossing an edge of the terrain"
                 task = task._replace(ground=ground)
+            if iterations >= s.most_iterations:
+                failure = failure or ddp.STATUS[ddp.ITERATIONS]
+                break
             if last and not failure and not new:
                 if final:
                     break

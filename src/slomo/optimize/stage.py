@@ -176,5 +176,6 @@ def make_report(plan: Plan, config: Config) -> dict[str, Any]:
         "start": plan.solution.start,
         "attempts": list(plan.attempts),
         "scale": plan.scale,
+        "slowed": float((plan.reference.t[-1] - plan.reference.t[0]) / (plan.want.t[-1] - plan.want.t[0])),
         "cycle": None if plan.cycle is None else list(plan.cycle),
     }
