@@ -39,7 +39,7 @@ def reference(base, points, lam, *, h=0.05, robot=ROBOT) -> Reference:
 def standing(*, T=6, robot=ROBOT, height=0.0) -> Reference:
     base = np.tile([0, 0, robot.standing_height + height], (T, 1))
     points = robot.nominal_feet + base[:, None]
-    points[..., 2] = height
+    points[:, robot.feet, 2] = height
     C = len(robot.limbs)
     share = np.isin(np.arange(C), robot.feet) / len(robot.feet)
     lam = np.tile([0, 0, robot.mass * 9.81], (T - 1, C, 1)) * share[:, None]
@@ -178,7 +178,7 @@ def test_ground_that_is_not_zero(terrain):
 
 def test_weak_motors_are_named():
     weak = replace(ROBOT, effort=0.1 * ROBOT.effort)
-    out = refine(weak, standing(T=21), terrain=FLAT, mu=0.6, settings=Settings(iterations=25))
+    out = refine(weak, standing(T=21), terrain=FLAT, mu=0.6, settings=Settings(iterations=12))
     assert out.status != "converged"
     checks = verify_whole_body(weak, out.motion, terrain=FLAT, mu=0.6)
     assert not all(c.holds for c in checks.values())
@@ -247,3 +247,38 @@ def test_a_cycle_closes():
     q = turned.motion.q.copy()
     q[-1, 0] += 1e-4
     assert not verify_whole_body(ROBOT, replace(turned.motion, q=q), terrain=FLAT, mu=0.6)["cycle_gap"].holds
+
+
+def test_a_humanoid_stands():
+    """Toe and heel of each foot share its weight, hands carry nothing."""
+    robot = load_robot("g1")
+    out = refine(robot, standing(T=7, robot=robot), terrain=FLAT, mu=0.6)
+    assert out.status == "converged"
+    checks = verify_whole_body(robot, out.motion, terrain=FLAT, mu=0.6)
+    assert all(c.holds for c in checks.values()), {n: c for n, c in checks.items() if not c.holds}
+    assert out.motion.lam[3].sum(axis=0)[2] == pytest.approx(robot.mass * 9.81, rel=0.02)
+    assert out.motion.lam[:, 4:].max() < 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("robot", "name"), [("go1", "cat00"), ("a1", "cat00"), ("go2", "dog_cpr")])
+def test_key_points_of_the_paper(robot, name):
+    from slomo.formats import load_keypoints
+    from slomo.optimize import stage
+    from slomo.retarget import stage as retarget
+    from slomo.stage import Artifact, Inputs, Silent
+
+    path = SHARED / "keypoints" / f"{name}.json"
+    if not path.exists():
+        pytest.skip(f"{path} is not there")
+    motion = load_keypoints(path, note=lambda message: None)
+    config = retarget.Config(step_height=0.1 if name == "dog_cpr" else 0.0)
+    raw, robot = Artifact(npz={"keypoints.npz": motion.to_arrays()}), load_robot(robot)
+    source = retarget.run(Inputs(artifacts={"import": raw}, robot=robot), config, Silent())
+    out = stage.run(Inputs(artifacts={"retarget": source}, robot=robot), stage.Config(model="whole-body"), Silent())
+    report = out.json["report.json"]
+    assert out.failure is None
+    assert report["whole_body"]["status"] == "converged"
+    assert report["body_error"] < 0.02
+    assert report["foot_error"] < 0.03
+    WholeBody.from_arrays(out.npz["whole_body.npz"])
