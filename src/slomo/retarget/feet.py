@@ -8,6 +8,7 @@ from scipy.ndimage import gaussian_filter1d, median_filter, minimum_filter1d
 from slomo.retarget.clean import runs
 
 _HELD = 0.3  # of the legs' length: a foot whose floor is this much higher than the other one's of its pair never stands
+_SLOW = 0.35  # of a foot's swing speed
 _REARED = 0.5  # the same for a pair whose floor is higher than the other pair's, which a tilted camera also gives
 
 
@@ -92,8 +93,14 @@ def stance(lift: np.ndarray, speed: np.ndarray, *, dt: float, clearance: float, 
         (T, F) bool.
     """
     noise, swing = np.percentile(speed, [25, 95], axis=0)
-    slow = speed < np.maximum(np.maximum(0.35 * swing, np.minimum(3 * noise, 0.6 * swing)), 0.12)
+    slow = speed < np.maximum(np.maximum(_SLOW * swing, np.minimum(3 * noise, 0.6 * swing)), 0.12)
     return settled(slow & (lift < clearance), dt=dt, shortest=shortest)
+
+
+def slowness(xy: np.ndarray, *, dt: float) -> np.ndarray:
+    """(T, F) in (0, 1]: how slow each foot of xy (T, F, 2) m is for its own swing."""
+    speed = np.linalg.norm(np.gradient(xy, dt, axis=0), axis=2)
+    return np.exp(-((speed / np.maximum(_SLOW * np.percentile(speed, 95, axis=0), 1e-12)) ** 2))
 
 
 def settled(standing: np.ndarray, *, dt: float, shortest: float) -> np.ndarray:

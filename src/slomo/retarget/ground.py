@@ -79,7 +79,9 @@ def grounded(
     xy, lift, base = scale * subject.feet[..., :2], scale * over.lift, scale * origin[:, :2]
     clearance = _CLEARANCE * body.leg
 
-    low = np.exp(-((lift / clearance) ** 2)) * (subject.confidence > 0) * ~over.held
+    # A bridge over a gap says little, and a fast foot that is low is about to land, which is no slide.
+    seen = np.where(subject.confidence > 0, 1.0, 0.3) * (known & ~over.held)
+    low = np.exp(-((lift / clearance) ** 2)) * seen * feet.slowness(xy, dt=dt)
     drift = feet.slide(xy, low, dt=dt, smoothing=0.15)
     standing = _standing(subject, xy - drift[:, None], lift, over.held | ~known, clearance=clearance, dt=dt)
     drift = drift + feet.slide(xy - drift[:, None], standing.astype(float), dt=dt, smoothing=0.1)
