@@ -105,7 +105,7 @@ def _angles(
         sign = max(unit, key=lambda s: abs(unit[s].mean()) + 1e-3 * s)
         difference = unit[sign]
         if abs(difference.mean()) > _AGREES:
-            offset = float(np.angle(np.median(difference.real) + 1j * np.median(difference.imag)))
+            offset = float(np.arctan2(np.median(np.imag(difference)), np.median(np.real(difference))))
             start = "" if sign > 0 else "minus "
             degrees = f"{np.degrees(offset):+.0f} degrees"
             note(f"heading is {start}the first angle {degrees}, from the direction hind to front feet")

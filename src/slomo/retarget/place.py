@@ -1,18 +1,93 @@
 """The robot's body, hips, points and hands, from the paths of its soles: everything within reach."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
 from scipy.spatial.transform import Rotation
 
+from slomo.retarget.footprint import Footprint
+from slomo.retarget.ground import Walk
 from slomo.retarget.soles import RobotBody
-from slomo.retarget.subject import Hands
+from slomo.retarget.subject import Hands, Subject
+from slomo.retarget.trunk import Trunk
 from slomo.robot import Robot
 
 Array = np.ndarray
 _LONGEST, _SHORTEST = 0.97, 1.1  # of the joints' reach: what planning leaves of it (see `pointfoot`)
 _LOWEST = {"paw": 0.4, "foot": 0.65}  # of the leg: no lower does a body crouch over paws and over level feet
 _ANKLE = 0.6  # rad, how far ankles bend forward at ease
+_BRIDGED, _PLACED = 0.2, 0.1  # confidence of key points in a gap, and of a humanoid's that were never seen
 _EASE = 0.1  # s, over which the body gives way to what legs can reach
+
+
+@dataclass(frozen=True)
+class Placed:
+    """The robot over T frames.
+
+    Attributes:
+        base: (T, 3) m.  hips, points: (T, C, 3) m.  confidence: (T, C).  standing: (T, C) bool.
+        moved: m, the most by which the body gave way to what legs reach.  drawn: (T, S) bool, swings that did.
+        beyond: (T, C') bool, points of seen feet that are still out of reach.
+    """
+
+    base: Array
+    hips: Array
+    points: Array
+    confidence: Array
+    standing: Array
+    moved: float
+    drawn: Array
+    beyond: Array
+
+
+def placed(
+    walk: Walk,
+    paths: Footprint,
+    trunk: Trunk,
+    subject: Subject,
+    under: Array,
+    robot: Robot,
+    body: RobotBody,
+    *,
+    dt: float,
+) -> Placed:
+    """Everything of the robot from the paths of soles and body; `under`: (T, S) m, ground under the soles."""
+    R, C = trunk.rotation, len(robot.limbs)
+    soles = np.concatenate([paths.soles, (under + walk.lift)[..., None]], axis=2)
+    pointing = walk.pointing - walk.trunk.heading[0]
+    confidence, standing = np.ones((len(soles), C)), np.zeros((len(soles), C), bool)
+    for s, columns in enumerate(body.points):
+        confidence[:, list(columns)] = subject.confidence[:, s, None]
+        standing[:, list(columns)] = walk.standing[:, s, None]
+    wanted = body.leg + walk.rise + under.mean(axis=1)
+    level = points_of(soles, pointing, np.zeros_like(pointing), robot, body)
+    z = body_height(wanted, paths.body, R, level, standing, robot, body, dt=dt)
+    base = np.column_stack([paths.body, z]) - R.apply(body.root)
+    hips = base[:, None] + np.einsum("tij,cj->tci", R.as_matrix(), robot.nominal_hips)
+    homes = np.column_stack([body.home, body.roots[:, 2]])
+    roots, homes = (base[:, None] + np.einsum("tij,sj->tsi", R.as_matrix(), x) for x in (body.roots, homes))
+    # A leg that was never seen stays under its hip.
+    unseen = ~walk.known
+    soles[:, unseen] = np.concatenate([homes[:, unseen, :2], under[:, unseen, None]], axis=2)
+    free = ~(walk.standing & walk.known)
+    down = droop(soles, roots, trunk.heading, free, under, body, dt=dt)
+    points = points_of(soles, pointing, down, robot, body)
+    soles, drawn = within_reach(soles, points, hips, free, under, robot, body)
+    points = points_of(soles, pointing, down, robot, body)
+    if body.hands:
+        columns = list(body.hands)
+        points[:, columns], confidence[:, columns] = hands_of(subject.hands, base, R, robot, body)
+    # A bridge over a gap is worth something. So is where an unseen foot or hand was put: without it, nothing would keep
+    # a toe before its heel. An unseen paw is free.
+    seen = np.any(confidence > 0, axis=0)
+    length = np.linalg.norm(points - hips, axis=2)
+    beyond = (length > robot.leg_reach[:, 1]) | (length < robot.leg_reach[:, 0])
+    return Placed(
+        base=base, hips=hips, points=points, standing=standing,
+        confidence=np.where(seen, np.maximum(confidence, _BRIDGED), _PLACED if body.length else 0.0),
+        moved=float(np.abs(z - wanted).max()), drawn=drawn, beyond=beyond[:, seen],
+    )  # fmt: skip
 
 
 def body_height(

@@ -21,7 +21,6 @@ from slomo.robot import Robot
 from slomo.stage import Artifact, Inputs, Progress
 
 VERSION = 5
-_BRIDGED, _PLACED = 0.2, 0.1  # confidence of key points in a gap, and of a humanoid's that were never seen
 
 
 @dataclass(frozen=True)
@@ -80,59 +79,26 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     progress.update(0.7, "terrain")
     terrain = make_terrain(paths.soles, stepping, height=config.step_height)
     under = terrain.height(paths.soles)
-    soles = np.concatenate([paths.soles, (under + walk.lift)[..., None]], axis=2)
-    R = trunk.rotation
-    pointing = walk.pointing - walk.trunk.heading[0]
-    confidence, standing = np.ones((len(soles), len(robot.limbs))), np.zeros((len(soles), len(robot.limbs)), bool)
-    for s, columns in enumerate(body.points):
-        confidence[:, list(columns)] = subject.confidence[:, s, None]
-        standing[:, list(columns)] = walk.standing[:, s, None]
-    points = place.points_of(soles, pointing, np.zeros_like(pointing), robot, body)
-    wanted = body.leg + walk.rise + under.mean(axis=1)
-    z = place.body_height(wanted, paths.body, R, points, standing, robot, body, dt=dt)
-    middle = np.column_stack([paths.body, z])
-    base = middle - R.apply(body.root)
-    roots = np.stack([base + R.apply(r) for r in body.roots], axis=1)
-    # A leg that was never seen stays under its hip.
-    unseen = ~walk.known
-    offset = np.einsum(
-        "tij,sj->tsi", R.as_matrix(), np.column_stack([body.home - body.roots[:, :2], 0 * body.home[:, 0]])
-    )
-    soles[:, unseen] = np.concatenate([(roots + offset)[:, unseen, :2], under[:, unseen, None]], axis=2)
-    hips = base[:, None] + np.einsum("tij,cj->tci", R.as_matrix(), robot.nominal_hips)
-    free = ~(walk.standing & walk.known)
-    down = place.droop(soles, roots, trunk.heading, free, under, body, dt=dt)
-    points = place.points_of(soles, pointing, down, robot, body)
-    soles, drawn = place.within_reach(soles, points, hips, free, under, robot, body)
-    points = place.points_of(soles, pointing, down, robot, body)
+    made = place.placed(walk, paths, trunk, subject, under, robot, body, dt=dt)
     if body.hands:
-        points[:, list(body.hands)], confidence[:, list(body.hands)] = place.hands_of(
-            subject.hands, base, R, robot, body
-        )
         _report_hands(subject, body, robot, report, progress)
-    # A bridge over a gap is worth something. So is where an unseen foot or hand was put: without it, nothing would keep
-    # a toe before its heel. An unseen paw is free.
-    seen = np.any(confidence > 0, axis=0)
-    confidence = np.where(seen, np.maximum(confidence, _BRIDGED), _PLACED if body.length else 0.0)
     names = ("base", *(f"{n}_hip" for n in robot.limb_names), *robot.key_points)
     result = KeypointMotion(
         t=motion.t - motion.t[0],
-        positions=np.concatenate([base[:, None], hips, points], axis=1),
+        positions=np.concatenate([made.base[:, None], made.hips, made.points], axis=1),
         names=names,
-        confidence=np.concatenate([np.ones((len(base), 1 + len(robot.limbs))), confidence], axis=1),
-        contact=standing.astype(float),
+        confidence=np.concatenate([np.ones((len(under), 1 + len(robot.limbs))), made.confidence], axis=1),
+        contact=made.standing.astype(float),
         contact_names=robot.key_points,
     )
-    distance = np.linalg.norm(soles - roots, axis=2)
-    beyond = (distance > body.reach[:, 1]) | (distance < body.reach[:, 0])
     report |= {
         "heading_change_rad": float(trunk.heading[-1] - trunk.heading[0]),
         "distance_m": float(np.linalg.norm(np.diff(paths.body, axis=0), axis=1).sum()),
         "stance_fraction": dict(zip(body.soles, walk.standing.mean(axis=0).round(3).tolist(), strict=True)),
-        "body_moved_for_reach_m": float(np.abs(z - wanted).max()),
-        "swings_drawn_fraction": float(drawn.mean()),
-        "beyond_reach_fraction": float(beyond[:, walk.known].mean()),
-        "unseen_limbs": [n for n, u in zip(body.soles, unseen, strict=True) if u],
+        "body_moved_for_reach_m": made.moved,
+        "swings_drawn_fraction": float(made.drawn.mean()),
+        "beyond_reach_fraction": float(made.beyond.mean()),
+        "unseen_limbs": [n for n, u in zip(body.soles, ~walk.known, strict=True) if u],
         "terrain_boxes": len(terrain.boxes),
     }
     if report["unseen_limbs"]:
