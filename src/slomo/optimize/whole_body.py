@@ -70,6 +70,7 @@ _NEARLY = 0.03
 # Of the cost, in relative tolerances: a millimetre off for two seconds.
 _FLOOR = 1e-3
 _MOST_RAISES = 3
+_CLOSING = 1e2
 
 
 def refine(
@@ -137,7 +138,7 @@ def _descend(
             trial = problem.evaluate(plus(x.q, step.dq), step.lam)
             actual = x.cost + price - trial.cost - trial.violations.price(penalties)
             if price < _NEARLY * (x.cost + _FLOOR) and step.decrease - price < s.tolerance * (x.cost + _FLOOR):
-                return x, "converged", n
+                return trial if actual > 0 else x, "converged", n
             if step.decrease < s.tolerance * (x.cost + price + _FLOOR):
                 # What is violated cannot be mended at this price.
                 lacking = x.violations.beyond(_SATISFIED)
@@ -157,11 +158,12 @@ def _descend(
 
 def _close(problem: Problem, program: Program, s: Settings, x: Point) -> tuple[Point, int]:
     """The nearest motion that satisfies everything to rounding, by Newton steps without a cost while they help."""
-    penalties = Penalties()
+    # So much of both that the program's own tolerance, of its objective, is no motion that matters.
+    penalties, damping = Penalties(*(_CLOSING * price for price in Penalties())), _CLOSING * problem.scale
     for n in range(s.closing):
         if not x.violations.beyond(_SATISFIED):
             return x, n
-        step = program.solve(problem.linearize(x, follow=False), penalties, damping=problem.scale, tolerance=1e-8)
+        step = program.solve(problem.linearize(x, follow=False), penalties, damping=damping, tolerance=1e-9)
         trial = problem.evaluate(plus(x.q, step.dq), step.lam)
         if not (step.solved and trial.violations.price(penalties) < x.violations.price(penalties)):
             return x, n + 1

@@ -168,9 +168,12 @@ class Program:
         for columns, value in zip(layout.slacks, penalties, strict=True):
             price[columns] = value
         A.data /= np.repeat(price, np.diff(A.indptr))
-        gradient, now = x.gradient.copy(), price * x.now
+        # Solved for the change of forces and torques, so that its tolerance is one of the step.
+        past, now = x.now.copy(), np.zeros(layout.n)
+        past[layout.slack] = 0.0
+        now[layout.slack] = (price * x.now)[layout.slack]
+        b, gradient = b - A @ past, x.gradient + x.P @ past
         gradient[layout.slack] = 1.0
-        gradient[layout.lam] -= damping[layout.lam] * x.lam
         P = sp.triu(x.P, format="csc")
         P.sort_indices()
         P.data[P.indptr[1:] - 1] += damping  # the diagonal ends each column, and is always stored
@@ -193,7 +196,7 @@ class Program:
         good = solution.status in (clarabel.SolverStatus.Solved, clarabel.SolverStatus.AlmostSolved)
         step, total = z - now, z + now
         decrease = -step @ gradient - 0.5 * (step @ (x.P @ total) + step @ (damping * total))
-        lam = _inside_cone(z[layout.lam], x.frames[1:], self.limits.mu)
+        lam = _inside_cone(x.lam + z[layout.lam], x.frames[1:], self.limits.mu)
         return Step(z[layout.dq], lam, float(decrease), bool(good and np.all(np.isfinite(z))))
 
     def _rows(self, x: Linearized) -> tuple[sp.csc_matrix, Array, int, int]:
