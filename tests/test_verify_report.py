@@ -6,7 +6,7 @@ import re
 import pytest
 
 from slomo.console import Console
-from slomo.optimize.check import Check, as_report
+from slomo.optimize.check import Check, as_report, digits, failure
 from slomo.report import checks as shown
 
 GOOD = {
@@ -41,6 +41,13 @@ def test_the_line_counts_and_names():
         "1 of 2 checks hold, worst is slip_per_second 0.04 of 0.01 m/s (hind_left, t = 1.25 s); "
         "warning: body_error 0.02 of 0.015 m (body, t = 0.50 s)"
     )
+
+
+def test_a_value_just_over_its_limit_reads_as_such():
+    assert failure({"torque_ratio": Check(1.00002, 1.0, "", 0.5, "knee")}) == (
+        "the reference does not verify: torque_ratio 1.00002 > 1 (knee, t = 0.50 s)"
+    )
+    assert [digits(x, 0.01) for x in (0.0100001, 0.00999999, 0.02, 0.01)] == ["0.0100001", "0.01", "0.02", "0.01"]
 
 
 @pytest.mark.parametrize(("checks", "states"), [(GOOD, "holds"), (WARNED, "warning"), (FAILED, "fails")])

@@ -62,13 +62,22 @@ def as_report(checks: Mapping[str, Check]) -> dict[str, Any]:
     }
 
 
+def digits(value: float, limit: float) -> str:
+    """The value with as many digits as it takes to see on which side of the limit it is, three at least."""
+    for n in range(3, 16):
+        text = f"{value:.{n}g}"
+        if (float(text) > limit) == (value > limit):
+            return text
+    return repr(value)
+
+
 def failure(checks: Mapping[str, Check]) -> str | None:
     """None, or one line that names what does not hold, the worst first, each with its place and time."""
     failed = sorted((n for n, c in checks.items() if not c.holds), key=lambda n: -checks[n].value / checks[n].limit)
     if not failed:
         return None
     parts = [
-        f"{n} {c.value:.3g} > {c.limit:.3g}{f' {c.unit}' if c.unit else ''} ({c.point}, t = {c.t:.2f} s)"
+        f"{n} {digits(c.value, c.limit)} > {c.limit:.3g}{f' {c.unit}' if c.unit else ''} ({c.point}, t = {c.t:.2f} s)"
         for n, c in ((n, checks[n]) for n in failed)
     ]
     return f"the reference does not verify: {', '.join(parts)}"

@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from slomo.optimize.check import digits
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -31,10 +33,9 @@ def as_table(report: Mapping[str, Any]) -> "Table":
         how = state(check)
         at = (check["point"], f"{check['t']:.2f}") if check["value"] > 0 else ("", "")
         unit = f" {check['unit']}" if check["unit"] else ""
-        table.add_row(
-            Text(how, style=STATES[how]), check["check"].replace("_", " "), f"{check['value']:.3g}{unit}",
-            f"{check['limit']:.3g}{unit}", *at,
-        )  # fmt: skip
+        value = f"{digits(check['value'], check['limit'])}{unit}"
+        name = check["check"].replace("_", " ")
+        table.add_row(Text(how, style=STATES[how]), name, value, f"{check['limit']:.3g}{unit}", *at)
     return table
 
 
@@ -53,4 +54,5 @@ def as_line(report: Mapping[str, Any]) -> str:
 
 def _value(check: Check) -> str:
     unit = f" {check['unit']}" if check["unit"] else ""
-    return f"{check['value']:.3g} of {check['limit']:.3g}{unit} ({check['point']}, t = {check['t']:.2f} s)"
+    value = digits(check["value"], check["limit"])
+    return f"{value} of {check['limit']:.3g}{unit} ({check['point']}, t = {check['t']:.2f} s)"
