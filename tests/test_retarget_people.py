@@ -193,6 +193,12 @@ def test_missing_hand_hangs_and_missing_foot_stays_under_its_hip():
     assert np.linalg.norm(motion["left_hand"] - motion["left_hand_hip"], axis=1).max() < G1.leg_reach[4, 1]
 
 
+def test_an_unseen_foot_leaves_the_ground_in_a_jump():
+    motion, _, _ = retarget(without(person(speed=0.0, jump=0.2, period=1.5), "right_ankle", "right_toe"))
+    np.testing.assert_allclose(motion["right_heel"][:, 2], motion["left_heel"][:, 2], atol=0.02)
+    assert motion["right_heel"][:, 2].max() > 0.1
+
+
 def test_a_step_under_one_foot():
     config = Config(step_height=0.06, step_limbs=("left_toe", "left_heel"))
     motion, report, _ = retarget(person(speed=0.0), config)

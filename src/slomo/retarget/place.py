@@ -67,9 +67,10 @@ def placed(
     hips = base[:, None] + np.einsum("tij,cj->tci", R.as_matrix(), robot.nominal_hips)
     homes = np.column_stack([body.home, body.roots[:, 2]])
     roots, homes = (base[:, None] + np.einsum("tij,sj->tsi", R.as_matrix(), x) for x in (body.roots, homes))
-    # A leg that was never seen stays under its hip.
+    # A leg that was never seen stays under its hip, on the ground while another one is.
     unseen = ~walk.known
-    soles[:, unseen] = np.concatenate([homes[:, unseen, :2], under[:, unseen, None]], axis=2)
+    height = under + walk.lift[:, walk.known].min(axis=1)[:, None]
+    soles[:, unseen] = np.concatenate([homes[:, unseen, :2], height[:, unseen, None]], axis=2)
     free = ~(walk.standing & walk.known)
     down = droop(soles, roots, trunk.heading, free, under, body, dt=dt)
     points = points_of(soles, pointing, down, robot, body)
