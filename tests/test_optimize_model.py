@@ -230,8 +230,8 @@ def make_task(rng, C, N=2, nu=None):
         h=np.full(N + 1, 0.05), ground=np.stack([slope(rng, C) for _ in range(N + 1)]), stick=rng.random((N, C)) < 0.5,
         q_ref=q, v_ref=rng.normal(size=(N + 1, nv)), u_ref=rng.normal(size=(N, nu)),
         w_x=rng.uniform(0, 5, (N + 1, 2 * nv)), w_u=rng.uniform(0, 1e-2, (N, nu)),
-        u_low=np.full((N, nu), -1e6), u_high=np.full((N, nu), 1e6), w_acceleration=0.3, w_slip=4.0, slip_load=2.0,
-        cyclic=False, shift=np.zeros(4),
+        u_low=np.full((N, nu), -1e6), u_high=np.full((N, nu), 1e6), w_acceleration=0.3, w_spin=0.02, w_slip=4.0,
+        slip_load=2.0, cyclic=False, shift=np.zeros(4),
     )  # fmt: skip
 
 
@@ -253,7 +253,7 @@ def test_cost_derivatives(free_step):
             ua = u + d[36:]
             dynamics.step(body, ua[12] if free_step else 0.05, 1e-2, ground, stick, qa, va, ua, q1, v1, lam)
             state = cost.state_cost(body, task, 0, qa, va, multiplier, rho)
-            return np.array([state + cost.input_cost(body, task, 0, ua, v1, lam, cone, rho)])
+            return np.array([state + cost.input_cost(body, task, 0, va, ua, v1, lam, cone, rho)])
 
         A, B, D = np.zeros((36, 36)), np.zeros((36, nu)), np.zeros((C, 3, 10))
         q1, v1, lam = np.zeros(19), np.zeros(18), np.zeros((C, 3))
@@ -261,7 +261,7 @@ def test_cost_derivatives(free_step):
         Lx, Lu, Lxx = np.zeros(2 * nv), np.zeros(nu), np.zeros((36, 36))
         Luu, Lux = np.zeros((nu, nu)), np.zeros((nu, 36))
         cost.state_derivative(body, task, 0, q, v, multiplier, rho, Lx, Lxx)
-        cost.input_derivative(body, task, 0, u, v1, lam, cone, rho, A, B, D, Lx, Lu, Lxx, Luu, Lux)
+        cost.input_derivative(body, task, 0, v, u, v1, lam, cone, rho, A, B, D, Lx, Lu, Lxx, Luu, Lux)
         g = numerical(total, np.zeros(36 + nu), eps=1e-5)[0]
         assert np.allclose(np.concatenate([Lx, Lu]), g, atol=1e-5 * np.abs(g).max())
         H = np.block([[Lxx, Lux.T], [Lux, Luu]])

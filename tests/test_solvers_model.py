@@ -46,8 +46,8 @@ def random_task(rng, model: PointFootModel, N: int, *, free_steps: bool) -> cost
         h=rng.uniform(0.02, 0.06, N + 1), ground=ground, stick=np.zeros((N, C), bool),
         q_ref=q, v_ref=rng.normal(size=(N + 1, nv)),
         u_ref=rng.normal(size=(N, nu)), w_x=rng.uniform(0, 5, (N + 1, 2 * nv)), w_u=rng.uniform(0, 1e-2, (N, nu)),
-        u_low=np.full((N, nu), -400.0), u_high=np.full((N, nu), 400.0), w_acceleration=0.3, w_slip=4.0, slip_load=2.0,
-        cyclic=False, shift=np.zeros(4),
+        u_low=np.full((N, nu), -400.0), u_high=np.full((N, nu), 400.0), w_acceleration=0.3, w_spin=0.02, w_slip=4.0,
+        slip_load=2.0, cyclic=False, shift=np.zeros(4),
     )  # fmt: skip
 
 
@@ -145,12 +145,12 @@ def test_cost_and_its_derivative(C):
         Lx, Lu = np.zeros(nx), np.zeros(nu)
         Lxx, Luu, Lux = np.zeros((nx, nx)), np.zeros((nu, nu)), np.zeros((nu, nx))
         cost.state_derivative(body, task, 0, q, v, *nothing, Lx, Lxx)
-        cost.input_derivative(body, task, 0, u, v1, lam, np.zeros(C), 1.0, A, B, D, Lx, Lu, Lxx, Luu, Lux)
+        cost.input_derivative(body, task, 0, v, u, v1, lam, np.zeros(C), 1.0, A, B, D, Lx, Lu, Lxx, Luu, Lux)
         J = cost.state_cost(body, task, 0, q, v, *nothing)
-        J += cost.input_cost(body, task, 0, u, v1, lam, np.zeros(C), 1.0)
+        J += cost.input_cost(body, task, 0, v, u, v1, lam, np.zeros(C), 1.0)
 
         x, us, p, part, x_next, forces = symbols(model, task)
-        total = cm.state_cost(x, part) + cm.input_cost(model, task, x_next, us, forces, part)
+        total = cm.state_cost(x, part) + cm.input_cost(model, task, x, x_next, us, forces, part)
         z = ca.vertcat(x, us)
         f = ca.Function("f", [x, us, p], [total, ca.gradient(total, z)])
         x0 = cm.to_tangent(task, np.stack([q] * 3), np.stack([v] * 3))[0]

@@ -162,10 +162,15 @@ def state_cost(x: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
     return 0.5 * p["h"] * ca.dot(p["w_x"], (x - p["x_ref"]) ** 2)
 
 
-def input_cost(model: PointFootModel, task: Task, x_next: ca.SX, u: ca.SX, lam: ca.SX, p: dict[str, ca.SX]) -> ca.SX:
-    """`cost.input_cost`: effort, acceleration of the body, and slip of loaded points. lam: (3, C)."""
+def input_cost(
+    model: PointFootModel, task: Task, x: ca.SX, x_next: ca.SX, u: ca.SX, lam: ca.SX, p: dict[str, ca.SX]
+) -> ca.SX:
+    """`cost.input_cost`: effort, accelerations of the body, and slip of loaded points. lam: (3, C)."""
     a = ca.sum2(ca.reshape(u[: 3 * model.C], 3, -1)) / model.mass - ca.DM([0, 0, model.g])
     cost = ca.dot(p["w_u"], (u - p["u_ref"]) ** 2) + task.w_acceleration * ca.dot(a, a)
+    h = u[3 * model.C] if u.numel() > 3 * model.C else p["h"]
+    spin = (State.of(x_next).w - State.of(x).w) / h
+    cost += task.w_spin * ca.dot(spin, spin)
     vf = State.of(x_next).vf
     for c in range(model.C):
         n = p["ground"][4 * c : 4 * c + 3]

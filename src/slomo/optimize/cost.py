@@ -3,7 +3,7 @@
     position, points, velocities     w (x - x_ref)^2
     orientation                      w |log(R_ref^T R)|^2
     inputs                           w |u - u_ref|^2
-    acceleration                     w |sum_c u_c / m + g|^2 of the body
+    acceleration                     w |sum_c u_c / m + g|^2 and w |(w_next - w) / h|^2 of the body
     slip                             w |s(gamma) v_next_t|^2 of each point, s = gamma / (gamma + slip_load)
     constraints                      augmented Lagrangian of `constraints`, of the friction cone of points that stick,
                                      and of the end state of a cyclic motion
@@ -38,7 +38,7 @@ class Task(NamedTuple):
         q_ref, v_ref, u_ref: (N + 1, 7 + 3 C), (N + 1, 6 + 3 C), (N, nu).
         w_x: (N + 1, 12 + 6 C) weights in tangent order.  w_u: (N, nu).
         u_low, u_high: (N, nu) limits of the inputs, N (and s).
-        w_acceleration, w_slip: weights.
+        w_acceleration, w_spin, w_slip: weights; w_spin is that of the body's angular acceleration.
         slip_load: N, normal force from which slip counts half.
         cyclic: whether the end state must be the first one, turned about z and moved by `shift`.
         shift: (4,) m, m, m, rad: p_end = R_z(shift[3]) p_first + shift[:3].
@@ -55,6 +55,7 @@ class Task(NamedTuple):
     u_low: Array
     u_high: Array
     w_acceleration: float
+    w_spin: float
     w_slip: float
     slip_load: float
     cyclic: bool
@@ -127,9 +128,13 @@ def state_derivative(body, task, k, q, v, multiplier, rho, Lx, Lxx):
 
 
 @compiled
-def input_cost(body, task, k, u, v1, lam, multiplier, rho):
-    """Cost of an input; v1 (6 + 3 C,) and lam (C, 3) are what the step gives. multiplier: (C,) of friction cones."""
+def input_cost(body, task, k, v, u, v1, lam, multiplier, rho):
+    """Cost of an input in a state of velocity v.
+
+    v1 (6 + 3 C,) and lam (C, 3) are what the step gives; multiplier (C,) is of the friction cones.
+    """
     C = body.hips.shape[0]
+    h = u[3 * C] if u.shape[0] > 3 * C else task.h[k]
     J = 0.0
     for i in range(u.shape[0]):
         J += task.w_u[k, i] * (u[i] - task.u_ref[k, i]) ** 2
@@ -138,6 +143,7 @@ def input_cost(body, task, k, u, v1, lam, multiplier, rho):
         for c in range(C):
             a += u[3 * c + i] / body.mass
         J += task.w_acceleration * a * a
+        J += task.w_spin * ((v1[3 + i] - v[3 + i]) / h) ** 2
     for c in range(C):
         n = task.ground[k + 1, c]
         gamma = slide = 0.0
@@ -176,7 +182,7 @@ def cone_penalty(rho):
 
 
 @compiled
-def input_derivative(body, task, k, u, v1, lam, multiplier, rho, A, B, D, Lx, Lu, Lxx, Luu, Lux):
+def input_derivative(body, task, k, v, u, v1, lam, multiplier, rho, A, B, D, Lx, Lu, Lxx, Luu, Lux):
     """Adds gradient and Gauss-Newton Hessian of `input_cost`; A, B, D as from `dynamics.linearize`."""
     C, nu = body.hips.shape[0], u.shape[0]
     nv = 6 + 3 * C
@@ -194,6 +200,7 @@ def input_derivative(body, task, k, u, v1, lam, multiplier, rho, A, B, D, Lx, Lu
             Lu[3 * c + i] += w * a / body.mass
             for n in range(C):
                 Luu[3 * c + i, 3 * n + i] += w / body.mass**2
+    _add_spin(h * task.w_spin, u[3 * C] if nu > 3 * C else h, v, v1, A, B, C, Lx, Lu, Lxx, Luu, Lux)
     # Residuals of one point depend on its position, velocity, its input, and on h where that is unknown.
     many = 10 if nu > 3 * C else 9
     J = np.empty(10)
@@ -231,6 +238,33 @@ def input_derivative(body, task, k, u, v1, lam, multiplier, rho, A, B, D, Lx, Lu
                         along = (lam[c, i] - gamma * plane[i]) / size - _INSIDE * body.mu * plane[i]
                         J[n] += along * D[c, i, n]
                 _add_point(rho * _CONE, force, J, many, c, C, nv, Lx, Lu, Lxx, Luu, Lux)
+
+
+@compiled
+def _add_spin(weight, h, v, v1, A, B, C, Lx, Lu, Lxx, Luu, Lux):
+    """Adds the square of the body's angular acceleration a = (w_next - w) / h, which forces and not h decide."""
+    nx, nf = A.shape[0], 3 * C
+    nv = nx // 2
+    if weight == 0.0:
+        return
+    for i in range(3):
+        row = nv + 3 + i
+        a = (v1[3 + i] - v[3 + i]) / h
+        w = weight / (h * h)
+        for n in range(nx):
+            x = A[row, n] - (1.0 if n == row else 0.0)
+            if x == 0.0:
+                continue
+            Lx[n] += weight * a / h * x
+            for m in range(nx):
+                Lxx[n, m] += w * x * (A[row, m] - (1.0 if m == row else 0.0))
+        for n in range(nf):
+            u = B[row, n]
+            Lu[n] += weight * a / h * u
+            for m in range(nf):
+                Luu[n, m] += w * u * B[row, m]
+            for m in range(nx):
+                Lux[n, m] += w * u * (A[row, m] - (1.0 if m == row else 0.0))
 
 
 @compiled

@@ -40,7 +40,7 @@ def evaluate(body, task, kappa, it, rho, gap, w):
     for k in range(N):
         u, ground, h = it.us[k], task.ground[k + 1], length(body, task, it.us[k], k)
         step(body, h, kappa, ground, task.stick[k], it.qs[k], it.vs[k], u, w.q1, w.v1, it.lam[k])
-        J += input_cost(body, task, k, u, w.v1, it.lam[k], it.cone[k], rho)
+        J += input_cost(body, task, k, it.vs[k], u, w.v1, it.lam[k], it.cone[k], rho)
         minus(w.q1, w.v1, it.qs[k + 1], it.vs[k + 1], gap[k])
         for i in range(gap.shape[1]):
             total += abs(gap[k, i])

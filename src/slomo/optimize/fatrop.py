@@ -51,7 +51,7 @@ class SmoothForm:
         x_next, lam = smooth_step(model, x, u, part)
         legs, low, high = cm.limits(model, x, part["quat_ref"])
         state = cm.state_cost(x, part)
-        cost = state + cm.input_cost(model, task, x_next, u, lam, part)
+        cost = state + cm.input_cost(model, task, x, x_next, u, lam, part)
         middle = Knot(ca.vertcat(x, u), p, cost, x_next, legs, low, high)
         # Any start, but with its points not under the ground; later on contact keeps them above.
         points, C = cm.State.of(x).f, model.C

@@ -74,7 +74,7 @@ class ComplementarityForm:
         low_path = np.concatenate([low, np.zeros(many), np.full(many, -np.inf)])
         high_path = np.concatenate([high, np.full(many, np.inf), np.zeros(many)])
         state = cm.state_cost(x, part)
-        cost = state + cm.input_cost(model, task, x_next, u, lam, part)
+        cost = state + cm.input_cost(model, task, x, x_next, u, lam, part)
         here = cm.State.of(x).f
         above = ca.vertcat(*(cm.gap(part["ground_here"][4 * c : 4 * c + 4], here[:, c]) for c in range(C)))
         self.knots = (

@@ -25,6 +25,7 @@ class Weights:
         position: 1/m^2, body.  orientation: 1/rad^2.  foot: 1/m^2, horizontal.  foot_height: 1/m^2.
         velocity: s^2/m^2, of the body.  angular_velocity: s^2/rad^2.  foot_velocity: s^2/m^2.
         effort: of forces as shares of the robot's weight.  acceleration: s^4/m^2, of the body.
+        spin: of the body's angular acceleration in units of g over the longest limb: whole robots have no such torques.
         slip: s^2/m^2.  slip_load: share of the robot's weight, normal force from which slip counts half.
     """
 
@@ -37,6 +38,7 @@ class Weights:
     foot_velocity: float = 0.3
     effort: float = 1.65
     acceleration: float = 0.05
+    spin: float = 0.5
     slip: float = 1000.0
     slip_load: float = 0.0156
 
@@ -164,6 +166,7 @@ def make_task(
         u_low=u_low,
         u_high=u_high,
         w_acceleration=weights.acceleration,
+        w_spin=weights.spin * (float(model.leg_max.max()) / model.g) ** 2,
         w_slip=weights.slip,
         slip_load=weights.slip_load * weight,
         cyclic=False,

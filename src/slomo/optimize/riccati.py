@@ -78,7 +78,7 @@ def backward(body, task, kappa, it, rho, reg, free_start, w):
             transpose_times(B, VB, Quu)
             for i in range(nu):
                 Lu[i] = 0.0
-            input_derivative(body, task, k, u, w.v1, it.lam[k], it.cone[k], rho, A, B, w.D, Lx, Lu, Qxx, Quu, Qux)
+            input_derivative(body, task, k, v, u, w.v1, it.lam[k], it.cone[k], rho, A, B, w.D, Lx, Lu, Qxx, Quu, Qux)
             state_derivative(body, task, k, it.qs[k], it.vs[k], it.multiplier[k], rho, Lx, Qxx)
             for i in range(nu):
                 Quu[i, i] += reg * (_PROX_U if i < nf else _PROX_H)

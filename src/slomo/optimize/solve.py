@@ -96,8 +96,8 @@ def warm_up(model: PointFootModel) -> float:
     task = Task(
         h=np.full(N + 1, 0.01), ground=up, stick=np.zeros((N, C), bool), q_ref=q.copy(), v_ref=np.zeros((N + 1, nv)),
         u_ref=np.zeros((N, 3 * C)), w_x=np.ones((N + 1, 2 * nv)), w_u=np.ones((N, 3 * C)),
-        u_low=np.full((N, 3 * C), -1.0), u_high=np.ones((N, 3 * C)), w_acceleration=1.0, w_slip=1.0, slip_load=1.0,
-        cyclic=False, shift=np.zeros(4),
+        u_low=np.full((N, 3 * C), -1.0), u_high=np.ones((N, 3 * C)), w_acceleration=1.0, w_spin=1.0, w_slip=1.0,
+        slip_load=1.0, cyclic=False, shift=np.zeros(4),
     )  # fmt: skip
     it = Iterate.at(q, np.zeros((N + 1, nv)), np.zeros((N, 3 * C)), C=C, M=constraints.number(Body.of(model)))
     body, work = Body.of(model), Work.make(it)

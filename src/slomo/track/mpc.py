@@ -191,7 +191,8 @@ class Mpc:
             q_ref=np.zeros((H + 1, nv + 1)), v_ref=np.zeros((H + 1, nv)),
             u_ref=np.zeros((H, 3 * C)), w_x=w, w_u=np.full((H, 3 * C), c.effort),
             u_low=np.tile(-model.u_max.ravel(), (H, 1)), u_high=np.tile(model.u_max.ravel(), (H, 1)),
-            w_acceleration=c.acceleration, w_slip=c.slip, slip_load=c.slip_load, cyclic=False, shift=np.zeros(4),
+            w_acceleration=c.acceleration, w_spin=0.0, w_slip=c.slip, slip_load=c.slip_load, cyclic=False,
+            shift=np.zeros(4),
         )  # fmt: skip
         self._work = Work.make(self._new_iterate())
         r = reference
