@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 from scipy.spatial.transform import Rotation
 
 from slomo.motion import Reference
@@ -37,9 +38,10 @@ SOLVERS = {
     "fatrop": ("slomo.optimize.fatrop", "solve_fatrop", "Fatrop, smooth contact"),
     "ipopt": ("slomo.optimize.ipopt", "solve_ipopt", "IPOPT, complementarity constraints"),
 }
-ATTEMPTS = 9
+ATTEMPTS = 10
 _MISSED, _MARGIN = 1e-3, 1.3  # m from which on a miss counts, and by what factor of it a leg is made shorter
-_WEAKER, _SLOWER = 2, 1.15  # attempts with limited forces before the motion is slowed down, and by what each time
+_WEAKER, _SLOWER = 4, 1.15  # attempts with limited forces before the motion is slowed down, and by what each time
+_NEIGHBOURS = 2  # steps to either side of an overloaded one that are limited with it
 _TIGHTER = 0.9  # of the force that would keep a joint just within its torque limit
 
 
@@ -178,7 +180,7 @@ def _reference(robot: Robot, model: PointFootModel, task: Task, solution: Soluti
 
 
 def _limit_forces(robot: Robot, reference: Reference, task: Task) -> Task:
-    """The task with the forces of a limb scaled down in the steps where one of its joints is overloaded."""
+    """The task with the forces of a limb scaled down around the steps where one of its joints is overloaded."""
     ratio = np.abs(joint_motion(robot, reference).tau) / robot.effort
     model = robot.model
     u_low, u_high = task.u_low.copy(), task.u_high.copy()
@@ -186,10 +188,14 @@ def _limit_forces(robot: Robot, reference: Reference, task: Task) -> Task:
         chain = model.supports[model.frames[model.getFrameId(name)].parentJoint]
         joints = [model.idx_vs[j] - 6 for j in chain if j > 1]
         over = ratio[:, joints].max(axis=1)
+        # What is taken away from one step must not come back in the next.
+        over = np.where(over > 1.0, over, 0.0)
+        near = maximum_filter1d(over, 2 * _NEIGHBOURS + 1)
         columns = slice(3 * c, 3 * c + 3)
-        for k in np.flatnonzero(over > 1.0):
+        for k in np.flatnonzero(near > 1.0):
             # A foot in the air can push no less than its own weight: what is small is left alone.
-            most = np.maximum(np.abs(reference.u[k, columns]) * _TIGHTER / over[k], 0.05 * u_high[k, columns])
+            there = np.abs(reference.u[max(k - _NEIGHBOURS, 0) : k + _NEIGHBOURS + 1, columns]).max(axis=0)
+            most = np.maximum(there * _TIGHTER / near[k], 0.05 * u_high[k, columns])
             u_high[k, columns] = np.minimum(u_high[k, columns], most)
             u_low[k, columns] = np.maximum(u_low[k, columns], -most)
     return task._replace(u_low=u_low, u_high=u_high)
