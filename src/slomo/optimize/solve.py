@@ -230,6 +230,8 @@ def _descend(
                 if final:
                     break
                 final = True
+            # A cycle's end is held more tightly than what is not exact can tell.
+            final = final or (task.cyclic and worst < _EARLY)
             reg = min(reg, 1e-3)
     closed = it.copy()
     ddp.close(body, task, s.kappas[-1], closed, work)
