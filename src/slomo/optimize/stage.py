@@ -57,6 +57,21 @@ class Config(problem.Weights):
     step_weight: float = 10.0
     starts: int = 4
 
+    def __post_init__(self):
+        for name in ("dt", "mu", "kappa", "iterations", "tolerance", "shortest_step", "starts"):
+            if not getattr(self, name) > 0:
+                raise UsageError(f"needs a number above 0, got {getattr(self, name)}", where=f"optimize.{name}")
+        for name in (*(f.name for f in fields(problem.Weights)), "step_weight"):
+            if not getattr(self, name) >= 0:
+                raise UsageError(f"needs a number of at least 0, got {getattr(self, name)}", where=f"optimize.{name}")
+        if not self.shortest_step <= 1 <= self.longest_step:
+            raise UsageError(
+                f"1 does not lie between {self.shortest_step} and {self.longest_step}", where="optimize.shortest_step"
+            )
+        for name, valid in (("model", MODELS), ("solver", tuple(SOLVERS))):
+            if getattr(self, name) not in valid:
+                raise UsageError(f"no {name} {getattr(self, name)!r}", where=f"optimize.{name}", valid=valid)
+
 
 def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     """The retargeted key points to `reference.npz`, `report.json` and `terrain.json`; `whole_body.npz` with that model.
@@ -69,7 +84,6 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     """
     robot = inputs.robot
     assert robot is not None
-    _check(config)
     source = inputs.artifacts["retarget"]
     motion = KeypointMotion.from_arrays(source.npz["keypoints.npz"])
     terrain = Terrain.from_json(source.json["terrain.json"])
@@ -138,23 +152,6 @@ def _whole_body(
     reference = point_foot_reference(robot, model, whole.motion)
     checks |= tracking_checks(reference, plan.want, model.names)
     return whole, replace(plan, reference=reference, checks=checks)
-
-
-def _check(config: Config) -> None:
-    for name in ("dt", "mu", "kappa", "iterations", "tolerance", "shortest_step", "starts"):
-        if not getattr(config, name) > 0:
-            raise UsageError(f"needs a number above 0, got {getattr(config, name)}", where=f"optimize.{name}")
-    for f in (*fields(problem.Weights), *(f for f in fields(Config) if f.name == "step_weight")):
-        if not getattr(config, f.name) >= 0:
-            raise UsageError(f"needs a number of at least 0, got {getattr(config, f.name)}", where=f"optimize.{f.name}")
-    if not config.shortest_step <= 1 <= config.longest_step:
-        raise UsageError(
-            f"1 does not lie between {config.shortest_step} and {config.longest_step}", where="optimize.shortest_step"
-        )
-    if config.model not in MODELS:
-        raise UsageError(f"no model {config.model!r}", where="optimize.model", valid=MODELS)
-    if config.solver not in SOLVERS:
-        raise UsageError(f"no solver {config.solver!r}", where="optimize.solver", valid=tuple(SOLVERS))
 
 
 def _steps(config: Config) -> problem.Steps | None:
