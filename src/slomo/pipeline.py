@@ -96,7 +96,9 @@ STAGES: dict[str, StageSpec] = {
         StageSpec(
             "import", "slomo.pipeline", "import", "run_import", "ImportConfig", "IMPORT_VERSION", (), ("keypoints",)
         ),
-        StageSpec("retarget", "slomo.retarget.stage", "retarget", upstream=("reconstruct",), robot=True),
+        StageSpec(
+            "retarget", "slomo.retarget.stage", "retarget", upstream=("reconstruct",), optional=("terrain",), robot=True
+        ),
         StageSpec("optimize", "slomo.optimize.stage", "optimize", upstream=("retarget",), robot=True),
         StageSpec("track", "slomo.track.stage", "track --sim", upstream=("optimize",), robot=True),
         StageSpec(

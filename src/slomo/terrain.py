@@ -3,8 +3,10 @@
 Where several cover a place the highest one counts. Everything is a function of x and y (m, world).
 """
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -138,11 +140,27 @@ class Terrain:
         return out
 
     @classmethod
+    def load(cls, path: Path) -> "Terrain":
+        """Read a file of the form of `terrain.json`. Raises `InvalidData`."""
+        try:
+            data = json.loads(path.read_text())
+        except OSError as e:
+            raise InvalidData(e.strerror or "cannot be read", where=path) from None
+        except (json.JSONDecodeError, UnicodeDecodeError) as e:
+            raise InvalidData(f"is not JSON ({e})", where=path) from None
+        try:
+            return cls.from_json(data)
+        except InvalidData as e:
+            raise InvalidData(str(e), where=path) from None
+
+    @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> "Terrain":
         """Inverse of `to_json`. Raises `InvalidData` on unknown or missing names."""
         known = [f.name for f in fields(cls)]
         if not isinstance(data, Mapping) or set(data) - set(known):
             raise InvalidData("has unknown entries", where="terrain", valid=known)
+        if not all(isinstance(data.get(name, []), list | tuple) for name in ("boxes", "slopes")):
+            raise InvalidData("boxes and slopes are lists", where="terrain")
         field = data.get("field")
         return cls(
             boxes=tuple(_make(Box, b) for b in data.get("boxes", ())),

@@ -189,18 +189,25 @@ def add_commands(app: typer.Typer) -> None:
                 "--from", metavar="reconstruct|import|FILE", help="Where the key points come from, if in doubt."
             ),
         ] = None,
+        terrain: Annotated[
+            str | None,
+            typer.Option("--terrain", metavar="FILE|none", help="Ground with steps and slopes (.json)."),
+        ] = None,
     ) -> None:
         """The motion in the robot's size: its base, hips and feet.
 
         \b
         slomo retarget --robot go1
         slomo retarget --robot go1 --from dog_cpr.json
+        slomo retarget --robot go1 --terrain hill.json
         """
         changes: dict[str, Any] = {}
         if source in ("reconstruct", "import"):
             changes["motion"] = source
         elif source is not None:
             changes = {"keypoints": session.user_path(Path(source), "keypoints"), "motion": "import"}
+        if terrain is not None:
+            changes["terrain"] = None if terrain == "none" else session.user_path(Path(terrain), "terrain")
         project = session.configure({"inputs": changes}, robot)
         runner = session.runner(project)
         session.emit_artifact(runner.make("retarget") if "keypoints" in changes else runner.make_only("retarget"))

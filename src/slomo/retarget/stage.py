@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from slomo.errors import InvalidData
+from slomo.errors import InvalidData, UsageError
 from slomo.motion import KeypointMotion
 from slomo.retarget import ground, human, place, prepare, quadruped
 from slomo.retarget.footprint import make_terrain, on_step, start_at_origin
 from slomo.retarget.soles import RobotBody
 from slomo.robot import Robot
 from slomo.stage import Artifact, Inputs, Progress
+from slomo.terrain import Terrain
 
 VERSION = 5
 
@@ -54,12 +55,15 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     """Key points of the creature to `keypoints.npz` (base, hips, points), `terrain.json` and `report.json`.
 
     Raises:
-        UsageError: a step under unknown limbs, or a part outside the motion.
+        UsageError: a step under unknown limbs or beside a terrain file, or a part outside the motion.
         InvalidData: too little usable motion, key points that do not span a trunk, a person for a quadruped or an
             animal for a humanoid.
     """
     robot = inputs.robot
     assert robot is not None
+    given = Terrain.load(inputs.files["terrain"]) if "terrain" in inputs.files else None
+    if given is not None and config.step_height:
+        raise UsageError("both a terrain file and a step are given", where="retarget.step_height", todo="set it to 0")
     source = KeypointMotion.from_arrays(next(iter(inputs.artifacts.values())).npz["keypoints.npz"])
     kind = _kind(source, robot)
     body = RobotBody.of(robot)
@@ -77,7 +81,11 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     dt = 1 / config.rate
     paths, trunk = start_at_origin(walk.paths, walk.trunk, body)
     progress.update(0.7, "terrain")
-    terrain = make_terrain(paths.soles, stepping, height=config.step_height)
+    if given is not None:
+        terrain = given
+        progress.note(f"the ground is that of {inputs.files['terrain'].name}, in the frame in which the motion starts")
+    else:
+        terrain = make_terrain(paths.soles, stepping, height=config.step_height)
     under = terrain.height(paths.soles)
     made = place.placed(walk, paths, trunk, subject, under, robot, body, dt=dt)
     if body.hands:

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports]
 import trimesh
 
-from slomo.errors import InvalidData
+from slomo.errors import InvalidData, UsageError
 from slomo.robot import Robot
 from slomo.robot_file import find_mesh
 from slomo.terrain import Terrain
@@ -106,6 +106,8 @@ def _up(robot: Robot, link: str) -> Array:
 
 
 def _add_ground(spec: mujoco.MjSpec, terrain: Terrain, friction: float) -> None:
+    if terrain.slopes or terrain.field is not None:
+        raise UsageError("slopes and height fields are planned for, but not simulated", where="terrain")
     common = {"contype": GROUND, "conaffinity": ROBOT, "friction": [friction, 0.005, 1e-4], "solref": CONTACT}
     spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], **common)
     for i, b in enumerate(terrain.boxes):
