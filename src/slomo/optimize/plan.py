@@ -42,6 +42,7 @@ ATTEMPTS = 10
 _MISSED, _MARGIN = 1e-3, 1.3  # m from which on a miss counts, and by what factor of it a leg is made shorter
 _WEAKER, _SLOWER = 4, 1.15  # attempts with limited forces before the motion is slowed down, and by what each time
 _NEIGHBOURS = 2  # steps to either side of an overloaded one that are limited with it
+_CALMER = 4.0  # on the weight of the trunk's angular acceleration
 _TIGHTER = 0.9  # of the force that would keep a joint just within its torque limit
 
 
@@ -148,11 +149,14 @@ def make_plan(
             overloaded += 1
             task = _limit_forces(robot, reference, task)
             remedies.append("forces limited where joints were overloaded")
+            if _trunk_overloaded(robot, reference):
+                task = task._replace(w_spin=_CALMER * task.w_spin)
+                remedies.append("a calmer trunk")
             if overloaded > _WEAKER and not wish.cyclic:
                 # Forces alone do not help: it is the motion that asks too much.
                 slower = _SLOWER ** (overloaded - _WEAKER)
                 slow = make_task(replace(want, t=slower * want.t, v=want.v / slower), wish.steps)
-                task = slow._replace(ground=task.ground, u_low=task.u_low, u_high=task.u_high)
+                task = slow._replace(ground=task.ground, u_low=task.u_low, u_high=task.u_high, w_spin=task.w_spin)
                 if wish.steps is not None:
                     task.u_low[:, -1], task.u_high[:, -1] = slow.u_low[:, -1], slow.u_high[:, -1]
                 remedies.append(f"the motion slowed down to {100 / slower:.0f} %")
@@ -199,6 +203,20 @@ def _limit_forces(robot: Robot, reference: Reference, task: Task) -> Task:
             u_high[k, columns] = np.minimum(u_high[k, columns], most)
             u_low[k, columns] = np.maximum(u_low[k, columns], -most)
     return task._replace(u_low=u_low, u_high=u_high)
+
+
+def _trunk_overloaded(robot: Robot, reference: Reference) -> bool:
+    """Whether a joint is overloaded that carries no foot: then it is the trunk's acceleration that asks too much."""
+    ratio = (np.abs(joint_motion(robot, reference).tau) / robot.effort).max(axis=0)
+    model = robot.model
+    legs = {
+        model.idx_vs[j] - 6
+        for c, name in enumerate(robot.foot_names)
+        if np.isfinite(robot.clearance[c])
+        for j in model.supports[model.frames[model.getFrameId(name)].parentJoint]
+        if j > 1
+    }
+    return any(ratio[j] > 1.0 for j in range(len(ratio)) if j not in legs)
 
 
 def _less_room(robot: Robot, reference: Reference, model: PointFootModel) -> PointFootModel:
