@@ -146,7 +146,7 @@ def test_overloaded_joints_get_weaker_legs():
     strong = stage.run(Inputs({"retarget": source}, robot=ROBOT), stage.Config(), Silent()).json["report.json"]
     out = stage.run(Inputs({"retarget": source}, robot=weak), stage.Config(), Silent())
     assert strong["torque_ratio"] > 0.45
-    assert any("overloaded" in what for what in out.json["report.json"]["attempts"]) or out.failure is None
+    assert any("overloaded" in what for what in out.json["report.json"]["attempts"])
     assert out.json["report.json"]["torque_ratio"] < strong["torque_ratio"] / 0.45
 
 

@@ -19,7 +19,7 @@ from slomo.optimize import problem
 from slomo.optimize.check import Check
 from slomo.optimize.cost import Task
 from slomo.optimize.cycle import close, end_shift, find_cycle
-from slomo.optimize.inverse import joint_motion
+from slomo.optimize.inverse import JointMotion, joint_motion
 from slomo.optimize.iterate import Iterate
 from slomo.optimize.problem import Steps, Targets, Weights
 from slomo.optimize.scale import best_scale
@@ -138,18 +138,18 @@ def make_plan(
             best = badness, reference, checks, solution
         if wish.solver != "ddp" or len(attempts) >= ATTEMPTS or not wrong:
             break
-        remedies = []
+        remedies, joints = [], joint_motion(robot, reference)
         if "slip_per_second" in wrong and not settings.strict:
             settings = replace(settings, strict=True)
             remedies.append("loaded feet made to stick")
         if "joint_miss" in wrong:
-            legs = _less_room(robot, reference, legs)
+            legs = _less_room(joints, reference, legs)
             remedies.append("less room where joint limits kept a point back")
         if wrong & {"torque_ratio", "speed_ratio"}:
             overloaded += 1
-            task = _limit_forces(robot, reference, task)
+            task = _limit_forces(robot, joints, reference, task)
             remedies.append("forces limited where joints were overloaded")
-            if _trunk_overloaded(robot, reference):
+            if _trunk_overloaded(robot, joints):
                 task = task._replace(w_spin=_CALMER * task.w_spin)
                 remedies.append("a calmer trunk")
             if overloaded > _WEAKER and not wish.cyclic:
@@ -183,15 +183,15 @@ def _reference(robot: Robot, model: PointFootModel, task: Task, solution: Soluti
     )  # fmt: skip
 
 
-def _limit_forces(robot: Robot, reference: Reference, task: Task) -> Task:
+def _limit_forces(robot: Robot, joints: JointMotion, reference: Reference, task: Task) -> Task:
     """The task with the forces of a limb scaled down around the steps where one of its joints is overloaded."""
-    ratio = np.abs(joint_motion(robot, reference).tau) / robot.effort
+    ratio = np.abs(joints.tau) / robot.effort
     model = robot.model
     u_low, u_high = task.u_low.copy(), task.u_high.copy()
     for c, name in enumerate(robot.foot_names):
         chain = model.supports[model.frames[model.getFrameId(name)].parentJoint]
-        joints = [model.idx_vs[j] - 6 for j in chain if j > 1]
-        over = ratio[:, joints].max(axis=1)
+        moved = [model.idx_vs[j] - 6 for j in chain if j > 1]
+        over = ratio[:, moved].max(axis=1)
         # What is taken away from one step must not come back in the next.
         over = np.where(over > 1.0, over, 0.0)
         near = maximum_filter1d(over, 2 * _NEIGHBOURS + 1)
@@ -205,9 +205,9 @@ def _limit_forces(robot: Robot, reference: Reference, task: Task) -> Task:
     return task._replace(u_low=u_low, u_high=u_high)
 
 
-def _trunk_overloaded(robot: Robot, reference: Reference) -> bool:
+def _trunk_overloaded(robot: Robot, joints: JointMotion) -> bool:
     """Whether a joint is overloaded that carries no foot: then it is the trunk's acceleration that asks too much."""
-    ratio = (np.abs(joint_motion(robot, reference).tau) / robot.effort).max(axis=0)
+    ratio = (np.abs(joints.tau) / robot.effort).max(axis=0)
     model = robot.model
     legs = {
         model.idx_vs[j] - 6
@@ -219,13 +219,12 @@ def _trunk_overloaded(robot: Robot, reference: Reference) -> bool:
     return any(ratio[j] > 1.0 for j in range(len(ratio)) if j not in legs)
 
 
-def _less_room(robot: Robot, reference: Reference, model: PointFootModel) -> PointFootModel:
+def _less_room(joints: JointMotion, reference: Reference, model: PointFootModel) -> PointFootModel:
     """The model with less room for a point that the joints cannot bring where the reference has it.
 
     A point missed along its leg changes the leg's limits. One missed across it moves the half-space of its workspace
     that looks most in that direction: the hull of what joints reach is larger than what they reach.
     """
-    joints = joint_motion(robot, reference)
     R = Rotation.from_quat(reference.q[:, 3:7])
     leg_min, leg_max, workspace = model.leg_min.copy(), model.leg_max.copy(), model.workspace.copy()
     normals = directions()
