@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from slomo.pinhole import Intrinsics
 from slomo.prior.labels import BINS, labels
 from slomo.reconstruct import evidence_terms, hypotheses, losses, silhouette
 from slomo.reconstruct.evidence import Evidence, gather, nearest
@@ -15,7 +16,6 @@ from slomo.reconstruct.hypotheses import GaitHypothesis
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.observations import Observations, observe
 from slomo.reconstruct.problem import Draw, Problem, Schedule, optimise
-from slomo.reconstruct.silhouette import Intrinsics
 from slomo.reconstruct.trajectory import Guess, Trajectory
 from slomo.skeleton import load_skeleton
 

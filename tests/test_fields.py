@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from slomo.errors import StageFailed, UsageError
+from slomo.pinhole import Intrinsics
 from slomo.reconstruct import silhouette
 from slomo.reconstruct.fields import mesh as meshing
 from slomo.reconstruct.fields import rays, skinning
@@ -20,7 +21,6 @@ from slomo.reconstruct.kinematics import Kinematics, rot
 from slomo.reconstruct.losses import State
 from slomo.reconstruct.observations import Observations
 from slomo.reconstruct.problem import Draw, Problem, Variables
-from slomo.reconstruct.silhouette import Intrinsics
 from slomo.reconstruct.trajectory import Guess, Trajectory
 from slomo.skeleton import load_skeleton
 from test_fit import _camera

@@ -8,12 +8,12 @@ import torch
 
 from slomo.errors import InvalidData, UsageError
 from slomo.motion import KeypointMotion
+from slomo.pinhole import Intrinsics
 from slomo.reconstruct import hypotheses, silhouette
 from slomo.reconstruct.fit_stage import run_fit
 from slomo.reconstruct.hypotheses import GaitHypothesis
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.refine_stage import ReconstructConfig, run_refine
-from slomo.reconstruct.silhouette import Intrinsics
 from slomo.rotation import umeyama
 from slomo.skeleton import load_skeleton
 from slomo.stage import Artifact, Inputs, Progress, Silent

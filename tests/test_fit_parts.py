@@ -9,10 +9,12 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from slomo.ground_path import whittaker
+from slomo.pinhole import Intrinsics
 from slomo.reconstruct import hypotheses, losses, silhouette
 from slomo.reconstruct.hypotheses import GaitHypothesis
 from slomo.reconstruct.kinematics import Kinematics, joint_rotation
-from slomo.reconstruct.silhouette import Intrinsics, Outline
+from slomo.reconstruct.silhouette import Outline
 from slomo.skeleton import list_skeletons, load_skeleton
 
 
@@ -142,7 +144,7 @@ def test_whittaker_keeps_a_line_and_drops_an_outlier():
     t = np.arange(60.0)
     y = np.stack([2 * t, -t], 1)
     y[30] += 500
-    x = hypotheses.whittaker(y, np.ones(60), 4.0)
+    x = whittaker(y, np.ones(60), 4.0)
     np.testing.assert_allclose(x[20:25], y[20:25], atol=1.0)
 
 

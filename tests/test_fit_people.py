@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
+from slomo.pinhole import Intrinsics
 from slomo.prior.labels import BINS
 from slomo.reconstruct import hypotheses, losses, pose_track, silhouette
 from slomo.reconstruct.evidence import gather
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.observations import observe
 from slomo.reconstruct.problem import Problem
-from slomo.reconstruct.silhouette import Intrinsics
 from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import load_skeleton
 

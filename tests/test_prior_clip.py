@@ -37,7 +37,7 @@ def test_mirrored_frames_are_repaired():
     wrong[20:26] = True  # several in a row
     p = bump(np.where(wrong, np.pi - said, said), other=np.where(wrong, said, np.pi - said), share=0.2)
     assert (apart(CENTRES[p.argmax(1)], truth) > np.radians(25)).mean() > 0.15
-    marginal, path = view_over_clip(p, t)
+    marginal, path = view_over_clip(p, t=t)
     assert path.dtype == marginal.dtype == np.float32
     assert np.allclose(marginal.sum(1), 1, atol=1e-5)
     assert apart(path, truth).max() < np.radians(20)
@@ -48,19 +48,19 @@ def test_mirrored_frames_are_repaired():
 def test_what_is_in_doubt_all_along_stays_so():
     t = np.arange(30) / FPS
     front = np.full(30, np.radians(30))
-    marginal, _ = view_over_clip(bump(front, other=np.pi - front, share=0.5), t)
+    marginal, _ = view_over_clip(bump(front, other=np.pi - front, share=0.5), t=t)
     assert np.where(apart(CENTRES, np.pi - front[:, None]) < np.radians(30), marginal, 0).sum(1).min() > 0.3
 
 
 def test_a_gap_allows_a_turn():
     t = np.concatenate([np.arange(10), 60 + np.arange(10)]) / FPS
     truth = np.repeat(np.radians([0.0, 170.0]), 10)
-    _, path = view_over_clip(bump(truth), t)
+    _, path = view_over_clip(bump(truth), t=t)
     assert apart(path, truth).max() < np.radians(5)
 
 
 def test_one_frame_is_a_clip_too():
-    marginal, path = view_over_clip(bump(np.array([1.0])), np.zeros(1))
+    marginal, path = view_over_clip(bump(np.array([1.0])), t=np.zeros(1))
     assert marginal.shape == (1, BINS)
     assert apart(path, 1.0)[0] < np.radians(5)
 
@@ -220,7 +220,9 @@ class Walk:
             flow[f] = moved.reshape(32, 32, 2).repeat(4, 0).repeat(4, 1)
         masks = np.ones((F, 128, 128), bool)
         frames_rgb = np.zeros((F, 128, 128, 3), np.uint8)
-        self.shots = Shots(np.arange(F), t, box, np.ones(F), frames_rgb, masks, Motion(flow, masks, t))
+        self.shots = Shots(
+            np.arange(F), t, box, np.ones(F), frames_rgb, masks, Motion(flow, masks, t), np.ones((F, 36)) / 36
+        )
 
     def __call__(self, crops):
         F = len(self.places)

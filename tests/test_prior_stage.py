@@ -130,10 +130,16 @@ def inputs(**files):
         source_width=2 * W, source_height=2 * H, width=W, height=H, rotation=0, fps=30.0, source_fps=60.0, start_s=1.0
     )
     frames = {"frames": rng.integers(0, 255, (T, H, W, 3), np.uint8), "t": np.arange(T) / 30.0}
+    # It looks up into the sky: nothing follows from where the subject goes.
+    camera = {
+        "K": np.array([[80.0, 0, W / 2], [0, 80, H / 2], [0, 0, 1]]),
+        "T_world_cam": np.tile(np.eye(4), (T, 1, 1)),
+    }
     return Inputs(
         artifacts={
             "decode": Artifact(npz={"frames.npz": frames}, json={"video.json": video}),
             "masks": Artifact(npz={"masks.npz": packed, "flow.npz": {"flow": flow}}),
+            "camera": Artifact(npz={"camera.npz": camera}),
         },
         files=files,
     )

@@ -82,8 +82,8 @@ STAGES: dict[str, StageSpec] = {
             "camera", _RECONSTRUCT, "reconstruct", "run_camera", "CameraConfig", "CAMERA_VERSION", ("decode", "masks")
         ),
         StageSpec(
-            "evidence", "slomo.prior.stage", "reconstruct", upstream=("decode", "masks"), shares=("skeleton", "fps"),
-            optional=("skeleton", "prior", "keypoints2d", "keypoint_model", "keypoint_map"),
+            "evidence", "slomo.prior.stage", "reconstruct", upstream=("decode", "masks", "camera"),
+            shares=("skeleton", "fps"), optional=("skeleton", "prior", "keypoints2d", "keypoint_model", "keypoint_map"),
         ),
         StageSpec(
             "fit", "slomo.reconstruct.fit_stage", "reconstruct", "run_fit", "FitConfig", "FIT_VERSION",

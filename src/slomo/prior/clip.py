@@ -16,22 +16,22 @@ _NEAR = 2  # bins on either side of the path over which its place is refined
 CENTRES = 2 * np.pi * np.arange(BINS) / BINS
 
 
-def view_over_clip(p: Array, t: Array) -> tuple[Array, Array]:
+def view_over_clip(*said: Array, t: Array) -> tuple[Array, Array]:
     """A hidden Markov model over the azimuth's bins (forward-backward and Viterbi; Rabiner, Proc. IEEE 1989).
 
     Args:
-        p: (F, 36) probability of the bins in each frame by itself. t: (F,) s.
+        said: (F, 36) probability of the bins in each frame by itself, of each source. t: (F,) s.
 
     Returns:
         (F, 36) probability given the whole clip; (F,) rad, the likeliest path, within its bin where the probability is.
     """
-    log_p = np.log(np.maximum(p, 1e-6)) * independent(t)[:, None]
+    log_p = sum(np.log(np.maximum(p, 1e-6)) for p in said) * independent(t)[:, None]
     dt = np.diff(t)
     unique, which = np.unique(np.round(dt, 4), return_inverse=True)
     moves = np.array([_moves(x) for x in unique]).reshape(-1, BINS, BINS)
     log_moves = np.log(moves)
 
-    F = len(p)
+    F = len(t)
     likely = np.exp(log_p - log_p.max(1, keepdims=True))
     ahead, back = np.empty((F, BINS)), np.ones((F, BINS))
     ahead[0] = likely[0] / likely[0].sum()

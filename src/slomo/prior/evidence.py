@@ -35,6 +35,7 @@ class Shots:
     Attributes:
         index: (F,) decoded frame. t: (F,) s. box: (F, 3) px. quality: (F,) of the masks, in [0, 1].
         frames: (T, H, W, 3) uint8 of the whole clip. masks: (T, H, W) bool. motion: of the whole clip.
+        travel: (F, 36) probability of the view's bins by the way that the subject goes.
     """
 
     index: Array
@@ -44,6 +45,7 @@ class Shots:
     frames: Array
     masks: Array
     motion: Motion
+    travel: Array
 
     def carried(self, places: Array) -> Array:
         """(F-1, ..., 2) px: places (F, ..., 2) px of each frame, carried to the next."""
@@ -91,7 +93,7 @@ def from_network(
     seen = prior(crops)
     say(0.8)
 
-    view, path = view_over_clip(seen.view, shots.t)
+    view, path = view_over_clip(seen.view, shots.travel, t=shots.t)
     up = up_over_clip(seen.up, seen.view, path, shots.t)
     places, mass = peaks(seen.heat, seen.size)
     sure = mass * seen.seen

@@ -6,19 +6,22 @@ from typing import Any
 import numpy as np
 
 from slomo.errors import InvalidData, UsageError
+from slomo.ground_path import ground_path
+from slomo.pinhole import Intrinsics
 from slomo.prior.crop import crop_box
 from slomo.prior.evidence import GRID, Columns, Dense, Shots, from_model, from_network, from_user
 from slomo.prior.external import ExternalModel, load_map
 from slomo.prior.frames import Motion, every
 from slomo.prior.inference import Prior, packaged
 from slomo.prior.labels import BINS, Labels, labels
+from slomo.prior.travel import view_of_travel
 from slomo.prior.user_keypoints import load_user_keypoints, to_decoded
 from slomo.skeleton import load_skeleton
-from slomo.stage import Artifact, Inputs, Progress
+from slomo.stage import Arrays, Artifact, Inputs, Progress
 
 Array = np.ndarray
 
-VERSION = 4
+VERSION = 5
 MOST_FRAMES = 600  # that are looked at: each takes 3 MB, and long clips are not to take more than others
 
 PRIORS = ("auto", "none")
@@ -50,8 +53,9 @@ class Config:
 def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     """Look at the clip.
 
-    Reads the artifacts "decode" (frames.npz, video.json) and "masks" (masks.npz, flow.npz), and the files "prior" (a
-    network of slomo's), "keypoints2d", "keypoint_model" with "keypoint_map", and "skeleton", where they are given.
+    Reads the artifacts "decode" (frames.npz, video.json), "masks" (masks.npz, flow.npz) and "camera" (camera.npz), and
+    the files "prior" (a network of slomo's), "keypoints2d", "keypoint_model" with "keypoint_map", and "skeleton",
+    where they are given.
 
     Returns:
         `evidence.npz`, over F frames; what nobody spoke about has no frames, and nothing has any when nobody spoke:
@@ -78,7 +82,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     if "keypoint_model" in files:
         model = ExternalModel(files["keypoint_model"], load_map(files["keypoint_map"], known.keypoints))
 
-    shots = _shots(inputs, config.fps)
+    shots = _shots(inputs, config.fps, known.kind)
     report: dict[str, Any] = {"skeleton": skeleton.name, "prior": "none", "weights_sha256": None, "sources": {}}
     columns: dict[str, Columns] = {}
     dense: Dense | None = None
@@ -135,7 +139,7 @@ def _name(prior: Prior, known: Labels) -> str:
     return f"{known.kind} (packaged)" if prior.path == packaged(known.kind) else f"{known.kind} ({prior.path.name})"
 
 
-def _shots(inputs: Inputs, fps: float) -> Shots:
+def _shots(inputs: Inputs, fps: float, kind: str) -> Shots:
     """The frames to look at: every n-th, fewer of a long clip, those without a subject left out."""
     decode, masks = inputs.artifacts["decode"].npz["frames.npz"], inputs.artifacts["masks"].npz
     packed = masks["masks.npz"]
@@ -143,15 +147,32 @@ def _shots(inputs: Inputs, fps: float) -> Shots:
     full = np.unpackbits(packed["packed"], axis=-1)[..., : int(packed["shape"][2])].astype(bool)
     index = np.arange(0, len(t), max(every(t, fps), -(-len(t) // MOST_FRAMES)))
     index = index[full[index].any((1, 2))]
+    camera = inputs.artifacts["camera"].npz["camera.npz"]
+    quality = np.asarray(packed["quality"], float)[index]
     return Shots(
         index=index,
         t=t[index],
         box=np.array([crop_box(full[f]) for f in index], float).reshape(-1, 3),
-        quality=np.asarray(packed["quality"], float)[index],
+        quality=quality,
         frames=decode["frames"],
         masks=full,
         motion=Motion(masks["flow.npz"]["flow"], full, t),
+        travel=_travel(t, index, full[index], quality, camera, kind),
     )
+
+
+def _travel(t: Array, index: Array, masks: Array, quality: Array, camera: Arrays, kind: str) -> Array:
+    """(F, 36) the view by the subject's path on the ground; masks (F, H, W), none empty."""
+    F, height, width = masks.shape
+    if F < 3:  # too few for a path
+        return np.full((F, BINS), 1 / BINS, np.float32)
+    f = np.asarray(camera["K"], float)
+    K = Intrinsics(f[0, 0], f[1, 1], f[0, 2], f[1, 2], width, height)
+    sides = [[np.flatnonzero(m.any(axis)) for axis in (0, 1)] for m in masks]
+    box = np.array([(u[0], v[0], u[-1], v[-1]) for u, v in sides], float)
+    T_world_cam = np.asarray(camera["T_world_cam"], float)
+    path = ground_path(t, index, K, T_world_cam, box, quality=quality, empty=np.zeros(F, bool))
+    return view_of_travel(path, t, index, T_world_cam, kind)
 
 
 def _arrays(shots: Shots, known: Labels, columns: dict[str, Columns], dense: Dense | None) -> dict[str, Array]:

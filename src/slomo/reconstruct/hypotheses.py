@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from slomo.ground_path import ground_path
 from slomo.reconstruct.evidence import Evidence
 from slomo.reconstruct.kinematics import Kinematics
-from slomo.reconstruct.observations import Observations, ground_points
+from slomo.reconstruct.observations import Observations
 from slomo.reconstruct.trajectory import Guess
 from slomo.skeleton import Gait, Skeleton
 
@@ -28,21 +29,6 @@ class GaitHypothesis:
     phase: float
 
 
-def whittaker(y: Array, weight: Array, smoothness: float) -> Array:
-    """(T, D) smoothed y (T, D): least squares with squared second differences (Whittaker 1923), made robust by Cauchy
-    reweighting. `smoothness` in frames is about the half width of the kernel."""
-    T = len(y)
-    D = np.diff(np.eye(T), 2, axis=0)
-    penalty = smoothness**4 * D.T @ D + 1e-9 * np.eye(T)
-    w = weight.astype(float)
-    for _ in range(4):
-        x = np.linalg.solve(np.diag(w) + penalty, w[:, None] * y)
-        r = np.linalg.norm(y - x, axis=1)
-        scale = 2.0 * max(np.median(r[weight > 0.1]) if (weight > 0.1).any() else 0.0, 1e-9)
-        w = weight / (1 + (r / scale) ** 2)
-    return x
-
-
 @dataclass(frozen=True)
 class RootGuess:
     """Coarse path of the subject, world units: middle of the body on the ground (T, 2), body length, heading of travel
@@ -56,48 +42,16 @@ class RootGuess:
 
 
 def root_guess(obs: Observations, skeleton: Skeleton) -> RootGuess:
-    """Depth from the lowest mask row on the ground, size from the box's height: both hold when the animal turns."""
-    at, K = obs.at.numpy(), obs.K
-    u0, v0, u1, v1 = obs.box.T
-    whole = (v1 < K.height - 2) & ~obs.empty
-    centred = (u0 > 0) & (u1 < K.width - 1)
-    ground = np.array([ground_points(K, obs.T_world_cam[k], np.array((a + b) / 2), np.array(c + 0.5))
-                       for k, a, b, c in zip(at, u0, u1, v1, strict=True)])  # fmt: skip
-    known = np.isfinite(ground).all(1) & ~obs.empty
-    if not known.any():
-        # Feet never below the horizon: no depth from the ground; put the subject at twice the camera's height.
-        mid = np.stack([obs.T_world_cam[at, 0, 3] + 4 * obs.T_world_cam[at, 0, 2],
-                        obs.T_world_cam[at, 1, 3] + 4 * obs.T_world_cam[at, 1, 2]], 1)  # fmt: skip
-        ground = np.concatenate([mid, np.zeros((len(mid), 1))], 1)
-        known = ~obs.empty
-    weight = known * obs.quality.numpy() * np.where(whole, 1.0, 0.02) * np.where(centred, 1.0, 0.1)
-    near = np.linalg.norm(ground - obs.T_world_cam[at, :3, 3], axis=1)
-    weight = weight * np.where(near < 30 * np.median(near[known]), 1.0, 0.0) + 1e-4 * known
-    fps = 1 / float(obs.dt.median())
-    path = whittaker(np.where(known[:, None], ground[:, :2], 0.0), weight, 0.25 * fps)
-    # Size of an upright thing of box height at that depth.
-    cam = obs.T_world_cam[at]
-    depth = np.einsum("fi,fi->f", np.concatenate([path, np.zeros((len(path), 1))], 1) - cam[:, :3, 3], cam[:, :3, 2])
-    level = np.linalg.norm(cam[:, :2, 2], axis=1).clip(0.3)
-    tall = (v1 - v0 + 1) * depth / K.fy / level
-    usable = whole & known & (v0 > 0)
-    rest = skeleton.rest()[:, 2]
-    height = skeleton.root_height + np.quantile(rest, 0.95) + (0.03 if skeleton.kind == "human" else 0.08)
-    length = float(np.median(tall[usable if usable.any() else known])) / height
+    """The path of the masks on the ground, and the body length of a rest pose as tall as they are."""
     t = obs.t.numpy()
-    full = np.stack([np.interp(t, t[at], path[:, i]) for i in range(2)], 1)
-    v = np.gradient(full, t, axis=0)
-    step = max(1, round(0.15 * len(t) / max(t[-1] - t[0], 1e-6)))
-    v = np.stack([np.convolve(np.pad(v[:, i], step, "edge"), np.ones(2 * step + 1) / (2 * step + 1), "valid")
-                  for i in range(2)], 1)  # fmt: skip
-    speed = np.linalg.norm(v, axis=1)
-    # Where the subject hardly moves the direction is taken from the times when it does.
-    slow = 0.25 * length
-    w = (speed / slow) ** 2 / (1 + (speed / slow) ** 2) + 1e-3
-    unit = whittaker(v / np.maximum(speed, 1e-9)[:, None], w, 0.3 * len(t) / max(t[-1] - t[0], 1e-6))
-    heading = np.unwrap(np.arctan2(unit[:, 1], unit[:, 0]))
-    travelled = float(np.linalg.norm(full[-1] - full[0])) / length
-    return RootGuess(full, length, heading, travelled, speed / length)
+    path = ground_path(t, obs.at.numpy(), obs.K, obs.T_world_cam, obs.box, quality=obs.quality.numpy(), empty=obs.empty)
+    rest = skeleton.rest()[:, 2]
+    length = path.height / (
+        skeleton.root_height + np.quantile(rest, 0.95) + (0.03 if skeleton.kind == "human" else 0.08)
+    )
+    travelled = float(np.linalg.norm(path.middle[-1] - path.middle[0])) / length
+    speed = np.linalg.norm(path.velocity, axis=1) / length
+    return RootGuess(path.middle, length, path.heading(t, 0.25 * length), travelled, speed)
 
 
 def said_headings(obs: Observations, said: Evidence | None, root: RootGuess) -> list[tuple[str, Array]]:

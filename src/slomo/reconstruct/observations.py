@@ -12,8 +12,8 @@ import numpy as np
 import torch
 
 from slomo.errors import InvalidData
+from slomo.pinhole import Intrinsics, ground_points
 from slomo.prior.frames import every, spread
-from slomo.reconstruct.silhouette import Intrinsics
 
 Array = np.ndarray
 Tensor = torch.Tensor
@@ -160,13 +160,6 @@ def _chain(flow: Mapping[str, Array], first: int, last: int, size: tuple[int, in
 def _at(image: Array, uv: Array) -> Array:
     """Values of an image at the places uv (H, W, 2) px, bilinear."""
     return cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR)
-
-
-def ground_points(K: Intrinsics, T_world_cam: Array, u: Array, v: Array) -> Array:
-    """World points on z = 0 that pixels u, v see; NaN for pixels that look at or above the horizon."""
-    rays = np.stack([(u - K.cx) / K.fx, (v - K.cy) / K.fy, np.ones_like(u, float)], -1) @ T_world_cam[:3, :3].T
-    down = np.where(rays[..., 2] < -1e-3, rays[..., 2], np.nan)
-    return T_world_cam[:3, 3] + rays * (-T_world_cam[2, 3] / down)[..., None]
 
 
 def _static(K: Intrinsics, T_world_cam: Array, mask: Array, flow: Array, ok: Array) -> Array:

@@ -8,21 +8,11 @@ from dataclasses import dataclass
 
 import torch
 
+from slomo.pinhole import Intrinsics
+
 Tensor = torch.Tensor
 
 NEAR = 1e-2  # world units: nothing closer to the camera is projected
-
-
-@dataclass(frozen=True)
-class Intrinsics:
-    """Pinhole of the working resolution: focal lengths and principal point in its pixels; its size."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    width: int
-    height: int
 
 
 def to_camera(R_cam_world: Tensor, centre: Tensor, X: Tensor) -> Tensor:

@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 import torch
 
+from slomo.pinhole import ground_points
 from slomo.reconstruct.fields.networks import Variables, encode
-from slomo.reconstruct.observations import Observations, ground_points
+from slomo.reconstruct.observations import Observations
 from slomo.reconstruct.trajectory import mlp
 
 Array = np.ndarray
