@@ -3,7 +3,7 @@
 # make train-prior   pictures, then the networks of src/slomo/prior/weights, from nothing: within the hour on two cores
 # make bench  the solvers of `slomo optimize` side by side, and with longer motions          (BENCH="--cap 60 --json")
 # make bench-random  spoiled key points through retarget and optimize: verified, refused, or neither  (BENCH="--count 20")
-# make bench-prior   those networks alone against truth      (WEIGHTS=folder: others; BENCH="--truth ... --masks ...")
+# make bench-prior   those networks, alone and over a clip, against truth      (WEIGHTS=folder: others; BENCH="--truth ... --projects ...")
 # make bench-parts   reconstruction without each of its parts
 # make bench-terms   reconstruction with and without each term of the prior   (BENCH="--seeds 5 --terms some")
 PYTHON ?= python3
@@ -11,8 +11,8 @@ ROBOT  ?= go1
 DEMO   := demo
 CLIP   := src/slomo/assets/walk
 KINDS  := quadruped human
-STEPS_quadruped := 11000
-STEPS_human     := 11000
+STEPS_quadruped := 8000
+STEPS_human     := 8000
 PRIOR  := prior-training
 SHIPPED := src/slomo/prior/weights
 

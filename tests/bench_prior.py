@@ -1,10 +1,11 @@
-"""Bench of the networks alone, frame by frame: `make bench-prior`, or
+"""Bench of the networks: `make bench-prior`, or
 
-    python tests/bench_prior.py [--weights FOLDER] [--truth FOLDER ...] [--masks FOLDER] [--pictures FOLDER]
+    python tests/bench_prior.py [--weights FOLDER] [--truth FOLDER ...] [--projects FOLDER] [--pictures FOLDER]
 
-Rendered clips with truth (truth.npz, clip.mp4, masks.npz in a folder each) with the true masks, and with those in
-`--masks` (<clip>.npz beside each other, `packed` and `shape` as in masks.npz); the camel's annotations; the time a
-frame takes. `--pictures` writes what the network sees and says.
+Rendered clips with truth (truth.npz, clip.mp4, masks.npz in a folder each) and the camel's annotations, three times:
+the network alone, frame by frame, with the true masks and with estimated ones, and what the stage `evidence` decides
+over the clip with estimated masks and camera. The estimates are made in projects below `--projects`, which a second
+call takes from there. Then the time a frame takes. `--pictures` writes what the network sees and says.
 """
 
 import argparse
@@ -14,9 +15,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from slomo.cli.session import Session
+from slomo.prior import metrics
 from slomo.prior.evaluate import Truth, judge, predict, truth_of
 from slomo.prior.inference import Prior, packaged, peaks
-from slomo.prior.labels import Labels, labels
+from slomo.prior.labels import Labels, labels, view_of
 from slomo.reconstruct.video import decode
 from slomo.skeleton import load_skeleton
 
@@ -46,6 +49,41 @@ def badja(known: Labels, path: Path) -> Truth:
         known_there = visible[:, joint] & (xy[:, joint] > 0).all(-1)
         keypoints[:, known.keypoints.index(name)] = np.where(known_there[:, None], xy[:, joint], np.nan)
     return Truth(frames, keypoints, np.full((len(frames), 3, 3), np.nan))
+
+
+def evidence(project: Path, clip: Path, kind: str, weights: Path) -> tuple[Path, Path]:
+    """The folder of the artifact `evidence` of a clip, made with a network, and that of the masks it is made with."""
+    session = Session(project_option=project)
+    project.mkdir(parents=True, exist_ok=True)
+    files = {"clip": session.user_path(clip, "clip"), "prior": session.user_path(weights, "prior")}
+    if (u2net := SHARED / "weights" / "u2netp.onnx").is_file():
+        files["weights"] = session.user_path(u2net, "weights")
+    made = session.configure({"inputs": files, "reconstruct": {"skeleton": kind}})
+    runner = session.runner(made)
+    said, masks = (session.root / runner.make(stage)["directory"] for stage in ("evidence", "masks"))
+    return said, masks
+
+
+def judge_clip(known: Labels, artifact: Path, masks: np.ndarray, truth: Truth) -> dict[str, float]:
+    """Shares that are right of what was decided over the clip, at the judged frames that were looked at."""
+    with np.load(artifact / "evidence.npz") as z:
+        said = dict(z)
+    index = [int(np.abs(said["frame"] - f).argmin()) for f in truth.frames]
+    near = np.abs(said["frame"][index] - truth.frames) <= 1
+    index, frames = np.array(index)[near], np.flatnonzero(near)
+    size = np.sqrt(masks[truth.frames[frames]].sum((1, 2)))
+    names = [str(n) for n in said["keypoint_names"]]
+    order = [names.index(n) for n in known.keypoints]
+    places = said["keypoints"][index][:, order]
+    error = metrics.keypoint_errors(places, truth.keypoints[frames], size)
+    azimuth = metrics.azimuth_error(said["view_path"][index], view_of(truth.R_view_body[frames])[0])
+    sides = metrics.share(metrics.sides_right(places, truth.keypoints[frames], size, known.keypoints))
+    return {
+        "frames": len(frames), "azimuth": metrics.within(azimuth, metrics.VIEW),
+        "azimuth_deg": float(np.degrees(np.nanmedian(azimuth))) if np.isfinite(azimuth).any() else np.nan,
+        "pck": metrics.within(error, metrics.PCK),
+        "pck_feet": metrics.within(error[:, metrics.feet(known.keypoints)], metrics.PCK), "sides": sides,
+    }  # fmt: skip
 
 
 def picture(crop: np.ndarray, parts: np.ndarray, places: np.ndarray, truth: np.ndarray, view: np.ndarray, text: str):
@@ -78,7 +116,7 @@ def main() -> None:
     parser.add_argument(
         "--truth", type=Path, nargs="*", default=sorted(p.parent for p in SHARED.glob("truth/*/truth.npz"))
     )
-    parser.add_argument("--masks", type=Path, help="Folder of <clip>.npz: estimated masks.")
+    parser.add_argument("--projects", type=Path, default=Path("bench/prior"), help="Where estimates are made.")
     parser.add_argument("--camel", type=Path, default=SHARED / "clips" / "camel")
     parser.add_argument("--pictures", type=Path)
     parser.add_argument("--every", type=int, default=2, help="Frames.")
@@ -100,9 +138,8 @@ def main() -> None:
             continue
         known, prior = labels(load_skeleton(kind)), Prior(path)
         frames = decode(folder / "clip.mp4", max_side=4096).frames
-        sources = {"true": folder / "masks.npz"}
-        if options.masks and (options.masks / f"{folder.name}.npz").is_file():
-            sources["est"] = options.masks / f"{folder.name}.npz"
+        decided, estimated = evidence(options.projects / folder.name, folder / "clip.mp4", kind, path)
+        sources = {"true": folder / "masks.npz", "est": estimated / "masks.npz"}
         for source, file in sources.items():
             masks = read_masks(file)
             if (folder / "truth.npz").is_file():
@@ -134,6 +171,11 @@ def main() -> None:
                 ]
                 image = np.concatenate(columns, 1)
                 cv2.imwrite(str(options.pictures / f"{folder.name}-{source}.png"), image[..., ::-1])
+        got = judge_clip(known, decided, read_masks(folder / "masks.npz"), truth)
+        print(
+            f"{folder.name:<16}{'clip':<6}{got['frames']:>6}{got['azimuth']:>6.2f}{'':>6}{got['azimuth_deg']:>7.1f}{'':>7}"
+            f"{got['pck']:>6.2f}{got['pck_feet']:>6.2f}{got['sides']:>7.2f}"
+        )
     print("\nPCK of each key point, mean over clips and masks")
     for name, x in sorted(worst.items(), key=lambda item: np.mean(item[1])):
         print(f"  {name:<32}{np.mean(x):.2f}")

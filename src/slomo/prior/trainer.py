@@ -34,7 +34,7 @@ class TrainConfig:
     batch: int = 32
     size: int = 128
     small: int = 96
-    early: float = 0.6
+    early: float = 0.7
     seed: int = 0
     rate: float = 2.5e-3
     warm: float = 0.08
