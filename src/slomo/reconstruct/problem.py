@@ -129,12 +129,13 @@ def rate(name: str) -> float:
     return RATES[max((k for k in RATES if name.startswith(k)), key=len)]
 
 
+def learnt(x: Variables, learn: tuple[str, ...]) -> list[str]:
+    """The variables that change, by name: Adam numbers its moments in this order, and a checkpoint keeps no other."""
+    return [k for k in sorted(x) if k.startswith(learn)]
+
+
 def adam(x: Variables, learn: tuple[str, ...]) -> torch.optim.Adam:
-    groups = [
-        {"params": [v.requires_grad_(True)], "lr": rate(k), "rate": rate(k)}
-        for k, v in x.items()
-        if k.startswith(learn)
-    ]
+    groups = [{"params": [x[k].requires_grad_(True)], "lr": rate(k), "rate": rate(k)} for k in learnt(x, learn)]
     return torch.optim.Adam(groups, betas=(0.9, 0.98))
 
 
@@ -148,7 +149,7 @@ def optimise(
     Hypotheses share nothing, so the sum of their losses is minimised.
     """
     optimiser = adam(x, schedule.learn + schedule.late)
-    late = [k.startswith(schedule.late) for k in x if k.startswith(schedule.learn + schedule.late)]
+    late = [k.startswith(schedule.late) for k in learnt(x, schedule.learn + schedule.late)]
     early = schedule.iterations - round(LATE * schedule.iterations) if schedule.late else schedule.iterations
     if adam_state is not None:
         optimiser.load_state_dict(optimiser.state_dict() | {"state": adam_state})
