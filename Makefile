@@ -11,8 +11,8 @@ ROBOT  ?= go1
 DEMO   := demo
 CLIP   := src/slomo/assets/walk
 KINDS  := quadruped human
-STEPS_quadruped := 8000
-STEPS_human     := 8000
+STEPS_quadruped := 8500
+STEPS_human     := 4000
 PRIOR  := prior-training
 SHIPPED := src/slomo/prior/weights
 

@@ -4,7 +4,7 @@ Which samples a batch holds and how they are augmented follows from the seed and
 training that was stopped goes on with the very batches that it would have had.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -108,15 +108,12 @@ def batches(
     labels: Labels,
     augment: AugmentConfig,
     *,
-    size: Callable[[int], int],
+    size: int,
     batch: int,
     seed: int,
     start: int = 0,
 ) -> Iterator[Batch]:
     """Endless batches from step `start` on: shards in a new order each epoch, samples mixed within groups of shards.
-
-    Args:
-        size: px, side of the input, of a step's number.
 
     Raises:
         InvalidData: all shards together are fewer samples than a batch.
@@ -137,7 +134,7 @@ def batches(
                     rng = np.random.default_rng([seed, step + i, 7])
                     yield collate(
                         [
-                            example(samples[row], labels, augment, rng, size=size(step + i))
+                            example(samples[row], labels, augment, rng, size=size)
                             for row in rows[i * batch : (i + 1) * batch]
                         ]
                     )

@@ -1,5 +1,4 @@
-"""A trained network as an ONNX file: weights stored as 8-bit integers with a scale a channel, small ones as float16,
-computed in float32, with what its numbers mean."""
+"""A trained network as an ONNX file: weights stored as float16, computed in float32, with what its numbers mean."""
 
 import io
 import json
@@ -16,7 +15,6 @@ from slomo.prior.network import CHANNELS, STRIDE, Network
 
 OPSET = 17
 HALVED = 64  # initialisers with fewer numbers stay as they are
-ROUNDED = 4096  # those with as many and more become integers
 
 
 def require_onnx() -> None:
@@ -56,23 +54,14 @@ def onnx_bytes(network: Network, about: dict[str, Any]) -> bytes:
         )
     network.train(training)
     model = onnx.load_from_string(out.getvalue())
-    casts, scales = [], []
+    casts = []
     for i, weight in enumerate(model.graph.initializer):
         if weight.data_type != TensorProto.FLOAT or np.prod(weight.dims) < HALVED:
             continue
-        name, x = weight.name, numpy_helper.to_array(weight)
-        if x.ndim < 2 or x.size < ROUNDED:
-            stored = numpy_helper.from_array(x.astype(np.float16), f"{name}.half")
-            casts.append(helper.make_node("Cast", [stored.name], [name], name=f"{name}.cast", to=TensorProto.FLOAT))
-        else:
-            scale = np.maximum(np.abs(x).max(axis=tuple(range(1, x.ndim)), keepdims=True), 1e-12) / 127
-            stored = numpy_helper.from_array(np.rint(x / scale).astype(np.int8), f"{name}.int8")
-            scales.append(numpy_helper.from_array(scale.astype(np.float32), f"{name}.scale"))
-            whole = f"{name}.whole"
-            casts.append(helper.make_node("Cast", [stored.name], [whole], name=f"{name}.cast", to=TensorProto.FLOAT))
-            casts.append(helper.make_node("Mul", [whole, scales[-1].name], [name], name=f"{name}.scaled"))
-        model.graph.initializer[i].CopyFrom(stored)
-    model.graph.initializer.extend(scales)
+        name, stored = weight.name, f"{weight.name}.half"
+        half = numpy_helper.from_array(numpy_helper.to_array(weight).astype(np.float16), stored)
+        model.graph.initializer[i].CopyFrom(half)
+        casts.append(helper.make_node("Cast", [stored], [name], name=f"{name}.cast", to=TensorProto.FLOAT))
     nodes = [*casts, *model.graph.node]
     del model.graph.node[:]
     model.graph.node.extend(nodes)

@@ -41,7 +41,7 @@ class Output(NamedTuple):
 class NetworkConfig:
     """Channels at 1/2, 1/4, 1/8 and 1/16 of the crop, and residual blocks at the last three; heads of the attention."""
 
-    widths: tuple[int, int, int, int] = (32, 48, 96, 160)
+    widths: tuple[int, int, int, int] = (32, 48, 80, 112)
     blocks: tuple[int, int, int] = (1, 1, 2)
     heads: int = 4
 

@@ -12,7 +12,6 @@ import platform
 import sys
 import time
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -29,7 +28,7 @@ from slomo.prior.export import onnx_bytes, require_onnx
 from slomo.prior.inference import Prior
 from slomo.prior.labels import labels
 from slomo.prior.objective import TERMS, class_weights
-from slomo.prior.trainer import TrainConfig, Trainer, input_size, learning_rate
+from slomo.prior.trainer import TrainConfig, Trainer, learning_rate
 from slomo.prior.validate import check, curves, score, temperatures
 from slomo.skeleton import load_skeleton
 from slomo.stage import Progress, Silent
@@ -66,12 +65,9 @@ def train(data: Path, out: Path, config: TrainConfig, progress: Progress) -> Pat
     )
     view = dict(size=config.size, batch=config.batch)
     held = list(fixed(held_paths, known, config.augment, **view))
-    sizes = partial(input_size, config=config)
     saved = logged = time.monotonic()
     recent: list[dict[str, float]] = []
-    stream = batches(
-        learned, known, config.augment, size=sizes, batch=config.batch, seed=config.seed, start=trainer.step
-    )
+    stream = batches(learned, known, config.augment, **view, seed=config.seed, start=trainer.step)
     while trainer.step < config.steps:
         recent.append(trainer.train(next(stream), weights))
         step, last = trainer.step, trainer.step == config.steps

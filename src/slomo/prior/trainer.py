@@ -23,7 +23,7 @@ class TrainConfig:
     Attributes:
         kind: skeleton.
         steps, batch: how long; samples a step.
-        size: px, side of the input.  small: px, side of it in the first `early` share of the steps: half the work.
+        size: px, side of the input.
         rate: highest learning rate.  warm: share of the steps until it is reached.  decay: of the weights.
         average: share of the averaged weights that a step leaves as it is.
         held_out: share of the shards to validate on.
@@ -33,8 +33,6 @@ class TrainConfig:
     steps: int = 4000
     batch: int = 32
     size: int = 128
-    small: int = 96
-    early: float = 0.7
     seed: int = 0
     rate: float = 2.5e-3
     warm: float = 0.08
@@ -49,16 +47,10 @@ class TrainConfig:
     def __post_init__(self):
         if self.kind not in list_skeletons():
             raise UsageError(f"no kind {self.kind!r}", where="train", valid=list_skeletons())
-        for size in (self.size, self.small):
-            if size % STRIDE or size < STRIDE:
-                raise UsageError(f"size is {size}", where="train", valid=[f"multiples of {STRIDE}"])
+        if self.size % STRIDE or self.size < STRIDE:
+            raise UsageError(f"size is {self.size}", where="train", valid=[f"multiples of {STRIDE}"])
         if min(self.steps, self.batch) < 1:
             raise UsageError("steps and batch must be 1 or more", where="train")
-
-
-def input_size(step: int, config: TrainConfig) -> int:
-    """px, side of the input of a step."""
-    return config.small if step < config.early * config.steps else config.size
 
 
 def learning_rate(step: int, config: TrainConfig) -> float:

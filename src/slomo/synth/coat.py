@@ -5,7 +5,6 @@ import colorsys
 import numpy as np
 
 from slomo.flesh import value_noise
-from slomo.prior.labels import labels
 from slomo.skeleton import Skeleton
 
 Array = np.ndarray
@@ -52,12 +51,7 @@ def coat(skeleton: Skeleton, link: Array, surface: Array, rng: np.random.Generat
                 base[mine] = trousers
             elif "knee" in name or "ankle" in name:
                 base[mine] = skin
-        if rng.random() < 0.7:
-            base[np.isin(link, [names.index("left_ankle"), names.index("right_ankle")])] = _colour(rng, natural=True)
-        head, line = link == names.index("head"), rng.uniform(0.0, 0.04)
-        if rng.random() < 0.93:  # not bald: behind the face, and above it
-            crown = labels(skeleton).b[list(skeleton.capsule_names).index("skull"), 2] + rng.uniform(0.0, 0.04)
-            base[head & ((surface[:, 0] < line) | (surface[:, 2] > crown))] = hair
+        base[np.isin(link, [names.index("head")]) & (surface[:, 0] < 0.02)] = hair
     else:
         for j in range(len(names)):  # socks, a dark tail, a pale face: each on both sides
             if rng.random() < 0.12:
@@ -70,34 +64,4 @@ def coat(skeleton: Skeleton, link: Array, surface: Array, rng: np.random.Generat
         p = _pattern(surface, rng)[:, None] * rng.uniform(0.3, 1.0)
         base = base * (1 - p) + _colour(rng, natural=not human) * p
     base *= (1 + rng.uniform(0, 0.4) * (value_noise(surface * 40, rng) - 0.5))[:, None]
-    if rng.random() < 0.85:
-        _face(skeleton, surface, base, rng)
     return np.clip(base, 0.02, 0.97)
-
-
-# Of the skull: fraction of its axis, direction, radius in radii of the skull. People's skulls stand upright.
-_EYES = {"quadruped": (0.3, (0.35, 0.8, 0.5), 0.3), "human": (0.35, (0.9, 0.4, 0.0), 0.3)}
-_MOUTH = {"quadruped": (1.0, (1.0, 0.0, 0.2), 0.4), "human": (0.0, (0.95, 0.0, -0.3), 0.3)}
-
-
-def _face(skeleton: Skeleton, surface: Array, base: Array, rng: np.random.Generator) -> None:
-    """Eyes, and a nose or a mouth, painted over colours `base` (V, 3) in place: what tells front from back."""
-    known = labels(skeleton)
-    kind = skeleton.kind if skeleton.kind in _EYES else "quadruped"
-    skull = list(skeleton.capsule_names).index("skull")
-    radius = float(skeleton.capsule_radii[skull].max())
-    dark = rng.uniform(0.02, 0.25, 3)
-
-    def spot(s: float, n: tuple[float, float, float], size: float, colour: Array) -> None:
-        unit = np.array(n) / np.linalg.norm(n)
-        at = known.canonical(np.array(skull), np.array(s), unit)
-        near = np.linalg.norm(surface - at, axis=1) < size * radius * rng.uniform(0.7, 1.3)
-        base[near] = colour
-
-    s, (x, y, z), size = _EYES[kind]
-    ring = rng.random() < 0.3
-    for side in (1, -1):
-        if ring:
-            spot(s, (x, side * y, z), 1.7 * size, rng.uniform(0.6, 0.95, 3))
-        spot(s, (x, side * y, z), size, dark)
-    spot(*_MOUTH[kind], dark if kind == "quadruped" else np.array([0.6, 0.2, 0.2]))

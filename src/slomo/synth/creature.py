@@ -107,7 +107,7 @@ def create(skeleton: Skeleton, seed: int) -> Creature:
     stretch[0 if skeleton.kind == "human" else 1] = 1 / what.squash
     ends = ends * stretch
     cones = [Cone(int(k), a, b + 1e-6, *r) for k, (a, b), r in zip(link, ends, radii, strict=True)]
-    vertices, triangles = mesh(cones, cell=0.38 * float(np.median(skeleton.capsule_radii)), blend=what.blend)
+    vertices, triangles = mesh(cones, cell=0.38 * float(np.median(skeleton.capsule_radii)), blend=0.012)
     distance = np.stack([c.distance(vertices) for c in cones], 1)
     near = np.full((len(vertices), skeleton.link_count), np.inf)
     for c, d in zip(cones, distance.T, strict=True):

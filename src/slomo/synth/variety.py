@@ -21,8 +21,7 @@ GROUPS = {
 GIRTHS = {
     "quadruped": {"trunk": (0.72, 1.3), "neck": (0.6, 1.35), "head": (0.75, 1.5), "tail": (0.5, 2.8),
                   "upper": (0.65, 1.25), "lower": (0.6, 1.9)},
-    "human": {"trunk": (0.7, 1.45), "head": (0.85, 1.25), "arm": (0.65, 1.7), "thigh": (0.65, 1.6),
-              "shank": (0.65, 1.8)},
+    "human": {"trunk": (0.85, 1.45), "head": (0.9, 1.25), "arm": (0.8, 1.7), "thigh": (0.8, 1.6), "shank": (0.8, 1.8)},
 }  # fmt: skip
 # Joint angles that hold the limbs apart while the skin is made: (word in the joint's name, side's sign on x), rad.
 APART = {"quadruped": {"shoulder": 0.25, "hip": 0.22}, "human": {"shoulder": 1.0, "hip": 0.22}}
@@ -35,7 +34,6 @@ class Build:
     Attributes:
         offset: (M, 3) nodes in their links.  radii, shift: (C, 2), (C, 2, 3) of the skeleton's capsules.
         squash: factor on the whole body's width (animals are deeper than wide), of people on their depth.
-        blend: body lengths over which the flesh of neighbouring bones flows together: lumpy or sleek.
         fur: body lengths, roughness of the outline.
         bind: (B, 3) rad, the pose in which the skin is made.  stance: (B, 3) rad, how it carries itself at rest.
     """
@@ -44,7 +42,6 @@ class Build:
     radii: Array
     shift: Array
     squash: float
-    blend: float
     fur: float
     bind: Array
     stance: Array
@@ -85,12 +82,12 @@ def build(skeleton: Skeleton, rng: np.random.Generator) -> Build:
         group[front], group[hind] = both * _factor(rng, 0.88, 1.14), both * _factor(rng, 0.88, 1.14)
         group[skeleton.group_names.index("neck")] *= both**0.6
     first = np.minimum(skeleton.mirror, np.arange(M))
-    own = np.exp(0.09 * rng.standard_normal(M))[first]
+    own = np.exp(0.12 * rng.standard_normal(M))[first]
     jitter = 0.02 * rng.standard_normal((M, 3))[first] * np.where(skeleton.offset == 0, 0.4, 1.0)
     jitter[:, 1] *= np.where(skeleton.mirror == np.arange(M), 0.0, np.where(first < np.arange(M), -1, 1))
     scale = np.where(skeleton.group < 0, 1.0, group[np.maximum(skeleton.group, 0)])
     offset = skeleton.offset * (scale * own)[:, None] + jitter
-    width = _factor(rng, *((0.7, 1.3) if kind == "human" else (0.7, 1.9)))
+    width = _factor(rng, *((0.75, 1.3) if kind == "human" else (0.7, 1.9)))
     offset[:, 1] *= width
     if kind == "quadruped":  # some are broad in front, some behind
         hips = np.array(["hip" in n for n in skeleton.names])
@@ -101,7 +98,7 @@ def build(skeleton: Skeleton, rng: np.random.Generator) -> Build:
              for p in (n.replace("right", "left") for n in known.parts)}  # fmt: skip
     whole = _factor(rng, 0.85, 1.2)
     c_first = np.minimum(skeleton.capsule_mirror, np.arange(len(girth)))
-    noise = np.exp(rng.uniform(0.03, 0.12) * rng.standard_normal((len(girth), 2)))[c_first]
+    noise = np.exp(0.12 * rng.standard_normal((len(girth), 2)))[c_first]
     for c, label in enumerate(known.capsule_part):
         girth[c] = whole * drawn[known.parts[label - 1].replace("right", "left")]
     radii = skeleton.capsule_radii * girth[:, None] * noise
@@ -116,8 +113,7 @@ def build(skeleton: Skeleton, rng: np.random.Generator) -> Build:
         rng.uniform(0.7, 1.08),
         (0.0 if rng.random() < 0.5 else rng.uniform(0, 0.25) * float(np.median(radii))),
     )
-    blend = float(np.median(skeleton.capsule_radii)) * rng.uniform(0.12, 0.4)
-    return Build(offset, radii, skeleton.capsule_shift * np.array([1, width, 1]), squash, blend, fur, bind, stance)
+    return Build(offset, radii, skeleton.capsule_shift * np.array([1, width, 1]), squash, fur, bind, stance)
 
 
 def extras(skeleton: Skeleton, what: Build, rng: np.random.Generator) -> list[Extra]:
@@ -150,11 +146,8 @@ def extras(skeleton: Skeleton, what: Build, rng: np.random.Generator) -> list[Ex
         for y in (1, -1):
             root = np.array([0.02, 0.4 * y * skull, 0.8 * skull])
             add("head", root, root + horn * [1, y, 1], 0.02, 0.008, "head")
-    if chance(0.7):  # a muzzle, and a forehead above it
+    if chance(0.5):  # a muzzle
         add("head", 0.4 * nose, nose * u(0.85, 1.05), u(0.05, 0.09), u(0.03, 0.06), "head")
-        if chance(0.5):
-            brow = np.array([0.03, 0, 0.3 * skull])
-            add("head", brow, brow + 0.25 * nose, u(0.7, 1.1) * skull, u(0.6, 0.95) * skull, "head")
     neck = what.offset[number["head"]]
     if chance(0.35):  # a mane, a ruff, a wattle
         drop = np.array([u(-0.08, 0.02), 0, u(-0.08, 0.08)])
