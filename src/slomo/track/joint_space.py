@@ -33,6 +33,8 @@ class JointCommand:
     q: Array
     v: Array
     tau: Array
+    kp: Array | float = 0.0
+    kd: Array | float = 0.0
 
 
 class JointSpace:
