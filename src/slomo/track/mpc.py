@@ -62,9 +62,13 @@ def _sample(knots, qs, vs, us, t, q, v, u):
     """State at time t between knots (N + 1,), by linear interpolation (rotations along the geodesic), and the velocity
     and input of the step that t is in, as the integrator has them. Outside of the knots it stands still."""
     N = us.shape[0]
-    k = 0
-    while k < N and t >= knots[k + 1] - 1e-9:
-        k += 1
+    k, after = 0, N + 1  # the last knot that is not later, by bisection: references may be minutes long
+    while after - k > 1:
+        middle = (k + after) // 2
+        if t >= knots[middle] - 1e-9:
+            k = middle
+        else:
+            after = middle
     moving = 1.0 if k < N and t >= knots[0] - 1e-9 else 0.0
     n = min(k + 1, N)
     a = moving * max(t - knots[k], 0.0) / (knots[n] - knots[k]) if n > k else 0.0
@@ -227,11 +231,13 @@ class Mpc:
         self.reset()
         return time.perf_counter() - start
 
-    def step(self, t: float, q: Array, v: Array) -> Plan:
+    def step(self, t: float, q: Array, v: Array, *, shift: Array | float = 0.0) -> Plan:
         """Plan from the measured state.
 
         Args:
             t: s, on the reference's clock.  q: (7 + 3 C,), v: (6 + 3 C,) as in `motion.Reference`.
+            shift: (C,) m, how much higher the ground under each point is found to be than the terrain says; the
+                reference's points go up with it.
         """
         start = time.perf_counter()
         c, task = self.config, self._task
@@ -244,6 +250,7 @@ class Mpc:
         knots[0] = t
         task.h[0] = knots[1] - t
         _sample_all(self._t_ref, self._q_ref, self._v_ref, self._u_ref, knots, task.q_ref, task.v_ref, task.u_ref)
+        task.q_ref[:, 9::3] += shift
         task.u_ref[knots[1:] > self.reference.t[-1] + 1e-9] = self._hold
         last = self._plan
         it = self._new_iterate()
@@ -254,6 +261,7 @@ class Mpc:
                 _sample_all(last.t, last.q, last.v, last.u, knots[: n + 1], it.qs[: n + 1], it.vs[: n + 1], it.us[:n])
         it.qs[0], it.vs[0] = q, v
         task.ground[:] = self.terrain.planes(it.qs[:, 7:].reshape(H + 1, C, 3))
+        task.ground[:, :, 3] += shift * task.ground[:, :, 2]
         status, _, _, defect, _ = ddp.solve(
             self._body, task, c.kappa, it, _PENALTY, False, c.iterations, c.tolerance, 1e-7, _REG, self._work
         )
