@@ -43,6 +43,11 @@ def with_lead_in(
     stance = np.ones(points.shape[:2], bool)
     s = np.clip(1 + t / SWING, 0, 1)
     for c, (p, w) in enumerate(zip(reference.points[0], v0[6:].reshape(-1, 3), strict=True)):
+        if model.is_hand[c]:
+            points[:, c] += ((s**3 - 1) * SWING / 3)[:, None] * w
+            speeds[:, c] = (s**2)[:, None] * w
+            stance[:, c] = False
+            continue
         if p[2] - terrain.height(p) < IN_AIR:
             continue
         points[:, c, :2] += ((s**3 - 1) * SWING / 3)[:, None] * w[:2]

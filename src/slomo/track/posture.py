@@ -32,9 +32,9 @@ class Posture:
         s = float(np.clip((t - self._t[k]) / (self._t[k + 1] - self._t[k]), 0, 1))
         return (1 - s) * self._q[k] + s * self._q[k + 1], (1 - s) * self._v[k] + s * self._v[k + 1]
 
-    def towards(self, plan: PlanPoint, t: float) -> tuple[Array, Array]:
-        """(nj,) rad and (nj,) rad/s of the plan, by one step of inverse kinematics from the reference's at time t."""
-        joints, speeds = self.at(t)
+    def towards(self, plan: PlanPoint) -> tuple[Array, Array]:
+        """(nj,) rad and (nj,) rad/s of the plan, by one step of inverse kinematics from the reference's then."""
+        joints, speeds = self.at(plan.t)
         state_q = np.concatenate([plan.position, plan.quat_xyzw])
         state_v = np.concatenate([plan.velocity, plan.angular_velocity])
         root = self._legs.root(state_q, state_v)

@@ -125,24 +125,23 @@ class WholeBodyQp:
                 return p.offset / np.linalg.norm(p.offset)
         raise AssertionError(heel)
 
-    def command(self, now: PlanPoint, ahead: PlanPoint, *, t: float, lookahead: float, u: Array, q: Array, v: Array) -> JointCommand:
+    def command(self, now: PlanPoint, ahead: PlanPoint, *, u: Array, q: Array, v: Array) -> JointCommand:
         """Torques for the state (q, v), and joint targets.
 
         Args:
-            now, ahead: the plan at t and t + lookahead.
-            t: s, on the reference's clock.  lookahead: s.
+            now, ahead: the plan now, and a little later, at which the joint targets aim.
             u: (C, 3) N, world, forces of the feet on the body, with feedback.
             q: (nq,) and v: (nv,), the whole robot in Pinocchio's convention.
         """
-        tau = self._solve(now, ahead, t, lookahead, u, q, v)
+        tau = self._solve(now, ahead, u, q, v)
         if tau is None:
             self.failures += 1
         else:
             self._tau = tau
-        joints, speeds = self.posture.towards(ahead, t + lookahead)
+        joints, speeds = self.posture.towards(ahead)
         return JointCommand(joints, speeds, self._tau, self.kp, self.kd)
 
-    def _solve(self, now, ahead, t, lookahead, u, q, v) -> Array | None:
+    def _solve(self, now: PlanPoint, ahead: PlanPoint, u: Array, q: Array, v: Array) -> Array | None:
         c, body = self.config, self.body
         body.update(q, v)
         weight = self.robot.mass * self.model.g
@@ -167,7 +166,7 @@ class WholeBodyQp:
         want = np.concatenate([linear, angular]) - body.drift(self._base)
         rows.append((body.jacobian(self._base), want, np.repeat([c.body, c.turn], 3)))
         # Feet and hands.
-        accelerations = (ahead.point_velocities - now.point_velocities) / lookahead
+        accelerations = (ahead.point_velocities - now.point_velocities) / max(ahead.t - now.t, 1e-3)
         for i, f in enumerate(self._points):
             if stance[i]:
                 want, w = -c.stance_kd * velocities[i], c.stance
@@ -195,7 +194,7 @@ class WholeBodyQp:
         H = (G * w[:, None]).T @ G
         f0 = -(G * w[:, None]).T @ g
         # Posture and forces have diagonal Hessians.
-        q_ref, v_ref = self.posture.at(t)
+        q_ref, v_ref = self.posture.at(now.t)
         posture = c.posture_kp * (q_ref - q[7:]) + c.posture_kd * (v_ref - v[6:])
         H[range(nj), range(nj)] += c.posture
         f0[:nj] -= c.posture * posture
