@@ -66,6 +66,7 @@ class QpConfig:
     force: float = 1e-3
     loaded: float = 0.02
     near: float = 0.012
+    still: float = 0.1
     margin: float = 0.05
     frequency: float = 20.0
     damping: float = 1.0
@@ -149,7 +150,8 @@ class WholeBodyQp:
         velocities = np.array([body.velocity(f)[:3] for f in self._points])
         ground = self.terrain.planes(positions)
         gap = np.sum(ground[:, :3] * positions, axis=1) - ground[:, 3]
-        stance = (now.lam[:, 2] > c.loaded * weight) & (gap < c.near) & ~self._hand
+        stays = np.linalg.norm(ahead.points - now.points, axis=1) < c.still * max(ahead.t - now.t, 1e-3)
+        stance = ((now.lam[:, 2] > c.loaded * weight) | stays) & (gap < c.near) & ~self._hand
         contacts = [p for p in self._contacts if stance[p.limb]]
         a0, A, t0, T = body.affine(contacts)
         nj, n = body.nj, A.shape[1]
