@@ -19,7 +19,7 @@ def _cache_folder() -> str:
     """The user's cache folder for these sources; "" (beside the sources) where there is no home."""
     digest = hashlib.sha256()
     here = Path(__file__).parent
-    for path in (*sorted(here.glob("*.py")), here.parent / "track" / "mpc.py"):
+    for path in (*sorted(here.glob("*.py")), here.parent / "track" / "plan.py"):
         digest.update(path.read_bytes())
     try:
         base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
