@@ -1,37 +1,26 @@
-"""The control loop: MPC, inverse kinematics, motor PD and the simulated robot, each at its rate."""
+"""The controller and the simulated robot, each at its rate."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from slomo.motion import Reference, Rollout
+from slomo.robot import Robot
 from slomo.stage import Progress
 from slomo.terrain import Terrain
-from slomo.track.joint_space import JointSpace
+from slomo.track.config import JOINT_HZ, Config
+from slomo.track.controller import Controller
+from slomo.track.disturbance import Disturbance
 from slomo.track.mpc import Mpc
 from slomo.track.simulation import Simulation
 
 Array = np.ndarray
 
 MOTOR_HZ = 1000
-JOINT_HZ = 500
 LARGEST_TILT = 60.0  # degrees
 LOWEST = 0.5  # of the height that the body should have
-
-
-@dataclass(frozen=True)
-class Gains:
-    """Motor PD.
-
-    Attributes:
-        kp: N m/rad.  kd: N m s/rad.
-        lookahead: s, how far ahead of now the joints aim on the plan.
-    """
-
-    kp: float
-    kd: float
-    lookahead: float
 
 
 @dataclass(frozen=True)
@@ -41,26 +30,37 @@ class Outcome:
     rollout: Rollout
     fall: str | None
     torque_ratio: Array
+    compile_seconds: float = 0.0
 
 
-def run_loop(
-    simulation: Simulation,
-    mpc: Mpc,
+def simulate(
+    robot: Robot,
+    reference: Reference,
     *,
     terrain: Terrain,
-    gains: Gains,
-    mpc_hz: int,
+    config: Config,
+    disturbance: Disturbance,
     progress: Progress,
+    world: Terrain | None = None,
+    planner: Callable[..., Mpc] = Mpc,
     reference_digest: str = "",
 ) -> Outcome:
-    """Follow the MPC's reference from its first time to its last, or until the robot falls.
+    """Follow the reference in MuJoCo from the lead-in's first time to the end, or until the robot falls.
 
     The simulation starts at rest in the reference's first pose. Poses and feet in the roll-out are in the reference's
     world, whose ground is the plane of the feet's centres: `foot_radius` below those of the roll-out's q.
+
+    Args:
+        reference: without a lead-in.
+        terrain: as it was planned; `world`: as it is, by default the same. The disturbance comes on top.
+        planner: see `Controller`.
     """
-    robot = simulation.robot
-    joints, reference = JointSpace(robot), mpc.reference
-    simulation.reset(joints.pose(reference.q[0]))
+    controller = Controller(robot, reference, terrain=terrain, config=config, planner=planner)
+    simulation = Simulation(robot, world or terrain, friction=config.friction, timestep=1 / MOTOR_HZ)
+    progress.update(0, "compiling the controller")
+    compiling = controller.warm_up()
+    reference = controller.reference
+    simulation.reset(controller.first_pose)
     t0, t1 = float(reference.t[0]), float(reference.t[-1])
     rows: dict[str, list] = {k: [] for k in ("t", "q", "v", "q_des", "tau", "body", "points", "lam")}
     solves: dict[str, list] = {k: [] for k in ("mpc_t", "mpc_ms", "mpc_status")}
@@ -68,18 +68,19 @@ def run_loop(
     for k in range(round((t1 - t0) * MOTOR_HZ)):
         t = t0 + k / MOTOR_HZ
         q, v = simulation.q, simulation.v
+        controller.observe(q, v)
         tick = k % (MOTOR_HZ // JOINT_HZ) == 0
         if tick:
-            q_point, v_point = joints.state(q, v)
-            if k % (MOTOR_HZ // mpc_hz) == 0:
-                plan = mpc.step(t, q_point, v_point)
+            before = controller.plan
+            command = controller.command(t)
+            plan = controller.plan
+            if plan is not before and plan is not None:
                 for name, x in zip(solves, (t, 1e3 * plan.seconds, plan.status), strict=True):
                     solves[name].append(x)
-            u = plan.feedback(t, q_point, v_point)
-            command = joints.command(plan.at(t + gains.lookahead), u=u, q=q)
-        asked = gains.kp * (command.q - q[7:]) + gains.kd * (command.v - v[6:]) + command.tau
+        asked = command.kp * (command.q - q[7:]) + command.kd * (command.v - v[6:]) + command.tau
         tau = np.clip(asked, -robot.effort, robot.effort)
         if tick:
+            q_point, _ = controller.joints.state(q, v)
             forces, body_down = simulation.contacts()
             row = (t, q, v, command.q, tau, q_point[:7], q_point[7:].reshape(-1, 3), forces)
             for name, x in zip(rows, row, strict=True):
@@ -101,7 +102,7 @@ def run_loop(
         joint_names=robot.joint_names,
         reference_digest=reference_digest,
     )
-    return Outcome(rollout, fall, np.array(ratios))
+    return Outcome(rollout, fall, np.array(ratios), compiling)
 
 
 def _at(reference: Reference, t: Array) -> Array:

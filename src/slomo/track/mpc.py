@@ -155,11 +155,13 @@ class Mpc:
         self.reset()
         return time.perf_counter() - start
 
-    def step(self, t: float, q: Array, v: Array) -> Plan:
+    def step(self, t: float, q: Array, v: Array, *, shift: Array | float = 0.0) -> Plan:
         """Plan from the measured state.
 
         Args:
             t: s, on the reference's clock.  q: (7 + 3 C,), v: (6 + 3 C,) as in `motion.Reference`.
+            shift: (C,) m, how much higher the ground under each point is found to be than the terrain says; the
+                reference's points go up with it.
         """
         start = time.perf_counter()
         c, task = self.config, self._task
@@ -173,6 +175,9 @@ class Mpc:
         knots[0] = t
         task.h[0] = knots[1] - t
         self._sample_reference(knots, task.q_ref, task.v_ref, task.u_ref)
+        if c.mpc_model == "lcp":
+            self._linearize(first)
+        task.q_ref[:, 9::3] += shift
         last = self._plan
         it = self._new_iterate()
         if last is not None:
@@ -184,8 +189,7 @@ class Mpc:
         # The LCP's gaps are about the reference, as all else in it.
         under = it.qs if c.mpc_model == "ncp" else task.q_ref
         task.ground[:] = self.terrain.planes(under[:, 7:].reshape(H + 1, C, 3))
-        if c.mpc_model == "lcp":
-            self._linearize(first)
+        task.ground[:, :, 3] += shift * task.ground[:, :, 2]
         status, _, _, defect, _ = ddp.solve(
             self._body, task, c.kappa, it, _PENALTY, False, c.iterations, c.tolerance, 1e-7, _REG, self._work
         )

@@ -16,9 +16,13 @@ def sample(knots, qs, vs, us, t, q, v, u):
     """State at time t between knots (N + 1,), by linear interpolation (rotations along the geodesic), and the velocity
     and input of the step that t is in, as the integrator has them. Outside of the knots it stands still."""
     N = us.shape[0]
-    k = 0
-    while k < N and t >= knots[k + 1] - 1e-9:
-        k += 1
+    k, after = 0, N + 1  # the last knot that is not later, by bisection: references may be minutes long
+    while after - k > 1:
+        middle = (k + after) // 2
+        if t >= knots[middle] - 1e-9:
+            k = middle
+        else:
+            after = middle
     moving = 1.0 if k < N and t >= knots[0] - 1e-9 else 0.0
     n = min(k + 1, N)
     a = moving * max(t - knots[k], 0.0) / (knots[n] - knots[k]) if n > k else 0.0

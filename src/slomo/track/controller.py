@@ -1,0 +1,100 @@
+"""From a robot's sensors to its motors: state, plan, joint targets. Knows no simulation and no network."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from slomo.motion import Reference
+from slomo.pointfoot import PointFootModel
+from slomo.robot import Robot
+from slomo.terrain import Terrain
+from slomo.track.config import Config
+from slomo.track.joint_space import JointCommand, JointSpace
+from slomo.track.lead_in import with_lead_in
+from slomo.track.mpc import Mpc
+from slomo.track.plan import Plan
+from slomo.track.sensors import SensorSample
+
+Array = np.ndarray
+
+
+class Controller:
+    """Follows a reference: `start` once, then `sense` for each sample and `command` at the joint rate.
+
+    Args:
+        robot: whose reference it is.
+        reference: starts at t = 0; the lead-in from a stand is put before it here.
+        terrain: ground as it was planned.
+        planner: makes the planner, `mpc.Mpc` or anything with its methods.
+
+    Attributes:
+        reference: with the lead-in; it begins at reference.t[0] < 0, on the controller's clock.
+        plan: the last one, None before the first tick.
+        point_state: ((7 + 3 C,), (6 + 3 C,)) the state from which the last command was made, as in `motion.Reference`.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        reference: Reference,
+        *,
+        terrain: Terrain,
+        config: Config,
+        planner: Callable[..., Mpc] = Mpc,
+    ):
+        model = PointFootModel.from_robot(robot, mu=config.mu)
+        self.robot, self.config, self.terrain = robot, config, terrain
+        self.reference = with_lead_in(reference, model, terrain=terrain, settle=config.settle, blend=config.blend)
+        self.planner = planner(model, self.reference, terrain=terrain, config=config)
+        self.joints = JointSpace(robot, kp=config.kp, kd=config.kd)
+        self.plan: Plan | None = None
+        self._begin(self.first_pose, np.zeros(robot.model.nv))
+
+    @property
+    def first_pose(self) -> Array:
+        """(nq,) in which the reference begins, standing."""
+        self.joints.reset()
+        return self.joints.pose(self.reference.q[0])
+
+    @property
+    def estimate(self) -> tuple[Array, Array]:
+        """q (nq,) and v (nv,) of the whole robot, Pinocchio's convention (root velocity in the root's frame)."""
+        return self._q, self._v
+
+    def warm_up(self) -> float:
+        """Compile everything that runs later; returns the seconds."""
+        return self.planner.warm_up()
+
+    def start(self, sample: SensorSample) -> None:
+        """Begin: the robot stands at rest in about `first_pose`."""
+        self._begin(self.first_pose, np.zeros(self.robot.model.nv))
+        self.sense(sample)
+
+    def sense(self, sample: SensorSample) -> None:
+        """Take in what was measured, at any rate up to 1 kHz."""
+        raise NotImplementedError("state estimation")
+
+    def observe(self, q: Array, v: Array) -> None:
+        """Instead of `sense`, for study: the true q (nq,) and v (nv,)."""
+        self._q, self._v = q, v
+
+    def command(self, t: float) -> JointCommand:
+        """What the motors shall do now; plans anew where that is due.
+
+        Args:
+            t: s, on the reference's clock; never less than before.
+        """
+        q, v = self.estimate
+        self.point_state = q_point, v_point = self.joints.state(q, v)
+        if self.plan is None or t >= self._due - 1e-6:
+            self.plan = self.planner.step(t, q_point, v_point)
+            period = 1 / self.config.mpc_hz
+            self._due += period * max(1.0, np.floor((t - self._due) / period + 1e-3) + 1)
+        u = self.plan.feedback(t, q_point, v_point)
+        return self.joints.command(self.plan.at(t), self.plan.at(t + self.config.lookahead), u=u, q=q, v=v)
+
+    def _begin(self, q: Array, v: Array) -> None:
+        self.plan, self._due = None, float(self.reference.t[0])
+        self.planner.reset()
+        self._q, self._v = q, v
+        self.point_state = self.joints.state(q, v)

@@ -1,0 +1,52 @@
+"""What the world does to the robot that the plan does not know."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+Array = np.ndarray
+
+PUSH_SECONDS = 0.1
+
+
+@dataclass(frozen=True)
+class Push:
+    """A horizontal push on the trunk at the base's origin, constant for `PUSH_SECONDS`.
+
+    Attributes:
+        impulse: N s.  time: s, when it begins, on the reference's clock.
+        direction: degrees, in the world from x to y.
+    """
+
+    impulse: float
+    time: float
+    direction: float
+
+    def force(self, t: float) -> Array:
+        """(3,) N, world, at time t."""
+        if not self.time <= t < self.time + PUSH_SECONDS:
+            return np.zeros(3)
+        a = np.radians(self.direction)
+        return self.impulse / PUSH_SECONDS * np.array([np.cos(a), np.sin(a), 0.0])
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """How the simulated world differs from the planned one. The defaults are no difference.
+
+    Attributes:
+        friction_scale: times the ground's friction coefficient.
+        payload: kg, a box on the trunk.  mass_scale: times mass and inertia of every link.
+        pushes: on the trunk.
+        latency: s, more from command to motor than the actuators have anyway.
+        step_height: m, added to the height of every box of the terrain.
+        seed: of the sensors' biases and noise.
+    """
+
+    friction_scale: float = 1.0
+    payload: float = 0.0
+    mass_scale: float = 1.0
+    pushes: tuple[Push, ...] = ()
+    latency: float = 0.0
+    step_height: float = 0.0
+    seed: int = 0
