@@ -1,7 +1,5 @@
 """From a robot's sensors to its motors: state, plan, joint targets. Knows no simulation and no network."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from slomo.motion import Reference
@@ -11,8 +9,8 @@ from slomo.terrain import Terrain
 from slomo.track.config import Config
 from slomo.track.joint_space import JointCommand, JointSpace
 from slomo.track.lead_in import with_lead_in
-from slomo.track.mpc import Mpc
 from slomo.track.plan import Plan
+from slomo.track.planner import make_planner
 from slomo.track.sensors import SensorSample
 
 Array = np.ndarray
@@ -25,7 +23,6 @@ class Controller:
         robot: whose reference it is.
         reference: starts at t = 0; the lead-in from a stand is put before it here.
         terrain: ground as it was planned.
-        planner: makes the planner, `mpc.Mpc` or anything with its methods.
 
     Attributes:
         reference: with the lead-in; it begins at reference.t[0] < 0, on the controller's clock.
@@ -40,12 +37,11 @@ class Controller:
         *,
         terrain: Terrain,
         config: Config,
-        planner: Callable[..., Mpc] = Mpc,
     ):
         model = PointFootModel.from_robot(robot, mu=config.mu)
         self.robot, self.config, self.terrain = robot, config, terrain
         self.reference = with_lead_in(reference, model, terrain=terrain, settle=config.settle, blend=config.blend)
-        self.planner = planner(model, self.reference, terrain=terrain, config=config)
+        self.planner = make_planner(config.controller, model, self.reference, terrain=terrain, config=config)
         self.joints = JointSpace(robot, kp=config.kp, kd=config.kd)
         self.plan: Plan | None = None
         self._begin(self.first_pose, np.zeros(robot.model.nv))

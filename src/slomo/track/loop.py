@@ -1,6 +1,5 @@
 """The controller and the simulated robot, each at its rate."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +12,6 @@ from slomo.terrain import Terrain
 from slomo.track.config import JOINT_HZ, Config
 from slomo.track.controller import Controller
 from slomo.track.disturbance import Disturbance
-from slomo.track.mpc import Mpc
 from slomo.track.simulation import Simulation
 
 Array = np.ndarray
@@ -42,7 +40,6 @@ def simulate(
     disturbance: Disturbance,
     progress: Progress,
     world: Terrain | None = None,
-    planner: Callable[..., Mpc] = Mpc,
     reference_digest: str = "",
 ) -> Outcome:
     """Follow the reference in MuJoCo from the lead-in's first time to the end, or until the robot falls.
@@ -53,9 +50,8 @@ def simulate(
     Args:
         reference: without a lead-in.
         terrain: as it was planned; `world`: as it is, by default the same. The disturbance comes on top.
-        planner: see `Controller`.
     """
-    controller = Controller(robot, reference, terrain=terrain, config=config, planner=planner)
+    controller = Controller(robot, reference, terrain=terrain, config=config)
     simulation = Simulation(robot, world or terrain, friction=config.friction, timestep=1 / MOTOR_HZ)
     progress.update(0, "compiling the controller")
     compiling = controller.warm_up()
