@@ -9,6 +9,7 @@ from slomo.terrain import Terrain
 from slomo.track.config import Config
 from slomo.track.joint_space import JointCommand, JointSpace
 from slomo.track.lead_in import with_lead_in
+from slomo.track.open_loop import STIFFER
 from slomo.track.plan import Plan
 from slomo.track.planner import make_planner
 from slomo.track.sensors import SensorSample
@@ -42,7 +43,8 @@ class Controller:
         self.robot, self.config, self.terrain = robot, config, terrain
         self.reference = with_lead_in(reference, model, terrain=terrain, settle=config.settle, blend=config.blend)
         self.planner = make_planner(config.controller, model, self.reference, terrain=terrain, config=config)
-        self.joints = JointSpace(robot, kp=config.kp, kd=config.kd)
+        kp, kd = STIFFER if config.controller == "open-loop" else (1.0, 1.0)
+        self.joints = JointSpace(robot, kp=kp * config.kp, kd=kd * config.kd)
         self.plan: Plan | None = None
         self._begin(self.first_pose, np.zeros(robot.model.nv))
 
