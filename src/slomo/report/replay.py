@@ -59,7 +59,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
 
     r = outcome.rollout
     hips, weight = PointFootModel.from_robot(robot).hips, robot.mass * GRAVITY
-    seen = RobotPanel(r, robot, world.ground, azimuth=AZIMUTH, fell=result.fall is not None)
+    seen = RobotPanel(r, robot, world.disturbance.ground(world.ground), azimuth=AZIMUTH, fell=result.fall is not None)
     panels: list[Panel] = [ReferencePanel(reference, robot, terrain, hips=hips, weight=weight, azimuth=AZIMUTH), seen]
     last = float(reference.t[-1])
     falls = FootFalls(robot.limb_names, reference.t[:-1], reference.lam[..., 2] > 1.0, r.t, r.lam[..., 2] > 1.0)
