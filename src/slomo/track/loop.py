@@ -77,6 +77,8 @@ def simulate(
     t0, t1 = float(reference.t[0]), float(reference.t[-1])
     recording = Recording(robot, reference, ticks=round((t1 - t0) * JOINT_HZ))
     joints, fall = JointSpace(robot), None
+    bodies = reference_at(reference, t0 + np.arange(recording.ticks) / JOINT_HZ)[:, :3]
+    wanted = bodies[:, 2] - terrain.height(bodies)
     for k in range(round((t1 - t0) * MOTOR_HZ)):
         t = t0 + k / MOTOR_HZ
         q, v = simulation.q, simulation.v
@@ -98,12 +100,12 @@ def simulate(
                 controller, t=t, q=q, v=v, q_des=command.q, tau=tau, asked=asked, body=q_point[:7],
                 points=q_point[7:].reshape(-1, 3), lam=forces,
             )  # fmt: skip
-            wanted = reference_at(reference, np.array([t]))[0]
-            fall = _fallen(q_point, float(wanted[2] - terrain.height(wanted)), ground, robot, body_down)
+            fall = _fallen(q_point, float(wanted[k // (MOTOR_HZ // JOINT_HZ)]), ground, robot, body_down)
             if fall:
                 fall = f"{fall} at {t:.2f} s"
                 break
-        simulation.push(disturbance.force(t))
+        if disturbance.pushes:
+            simulation.push(disturbance.force(t))
         simulation.step(tau)
         if k % 50 == 0:
             progress.update((t - t0) / (t1 - t0), f"{t:.1f} of {t1:.1f} s")

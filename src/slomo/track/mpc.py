@@ -45,7 +45,7 @@ class MpcConfig:
     mpc_model: str = "ncp"
     horizon: int = 10
     dt: float = 0.025
-    iterations: int = 4
+    iterations: int = 2
     tolerance: float = 1e-6
     mu: float = 0.6
     kappa: float = 1e-3
