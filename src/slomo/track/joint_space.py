@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
 from slomo.robot import Robot
-from slomo.track.mpc import PlanPoint
+from slomo.track.plan import PlanPoint
 
 Array = np.ndarray
 
@@ -44,12 +44,13 @@ class JointSpace:
     Deterministic: it starts from its last solution (the nominal pose after `reset`).
 
     Args:
-        kp: N m/rad, kd: N m s/rad, of every motor's PD.
+        kp: N m/rad, kd: N m s/rad, of the motors' PD: one number for all or (nj,).
     """
 
-    def __init__(self, robot: Robot, *, kp: float = 20.0, kd: float = 1.0):
+    def __init__(self, robot: Robot, *, kp: Array | float = 20.0, kd: Array | float = 1.0):
         self.robot, self.model, self.data = robot, robot.model, robot.model.createData()
-        self.kp, self.kd = np.full(len(robot.joint_names), kp), np.full(len(robot.joint_names), kd)
+        nj = len(robot.joint_names)
+        self.kp, self.kd = np.broadcast_to(kp, nj), np.broadcast_to(kd, nj)
         self._base = self.model.getFrameId(robot.base)
         self._feet = [self.model.getFrameId(name) for name in robot.foot_names]
         self._hips = [self.model.getFrameId(limb.hip) for limb in robot.limbs]
@@ -123,7 +124,7 @@ class JointSpace:
         feet = (ahead.points - ahead.position) @ R
         joints = self.solve(feet)
         _, J = self._feet_in_root(joints)
-        relative = (ahead.point_velocities - ahead.velocity) @ R - np.cross(ahead.angular_velocity, feet)
+        relative = (ahead.point_velocities - ahead.velocity) @ R - feet @ pin.skew(ahead.angular_velocity).T
         speeds = _damped_solve(J, (relative @ self._T_root_base.rotation.T).ravel())
         _, J_now = self._feet_in_root(q[7:])
         R_root = _matrix(q[3:7])

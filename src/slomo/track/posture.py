@@ -6,7 +6,7 @@ import pinocchio as pin  # pyright: ignore[reportMissingImports]
 from slomo.motion import Reference
 from slomo.optimize.inverse import Legs, joint_motion
 from slomo.robot import Robot
-from slomo.track.mpc import PlanPoint
+from slomo.track.plan import PlanPoint
 
 Array = np.ndarray
 

@@ -23,7 +23,7 @@ from slomo.robot import Robot
 from slomo.terrain import Terrain
 from slomo.track.floating_base import FloatingBase
 from slomo.track.joint_space import JointCommand
-from slomo.track.mpc import PlanPoint
+from slomo.track.plan import PlanPoint
 from slomo.track.posture import Posture
 from slomo.track.sole import contact_points
 
@@ -42,7 +42,6 @@ class QpConfig:
         stance: feet on the ground stay; stance_kd: 1/s, how their motion dies out.
         swing, swing_kp, swing_kd: feet in the air follow the plan.
         hand: hands do, with the same gains.
-        roll: a sole's tilt sideways.
         posture, posture_kp, posture_kd: all joints, towards the reference's angles.
         force: of forces as accelerations (f / robot mass), towards the planned ones.
         loaded: share of the weight above which a planned force makes a contact.
@@ -59,8 +58,8 @@ class QpConfig:
     swing_kp: float = 300.0
     swing_kd: float = 25.0
     hand: float = 0.03
-    roll: float = 0.03
     posture: float = 1e-3
+    trunk: float = 0.3
     posture_kp: float = 100.0
     posture_kd: float = 20.0
     force: float = 1e-3
@@ -111,6 +110,7 @@ class WholeBodyQp:
         data = self.body.model.createData()
         inertia = np.diag(pin.crba(self.body.model, data, robot.q_nominal))[6:]
         c = self.config
+        self._posture_weight = np.where(self._carried(), c.trunk, c.posture)
         self.kp, self.kd = inertia * c.frequency**2, 2 * c.damping * inertia * c.frequency
         self.reset()
 
@@ -120,10 +120,10 @@ class WholeBodyQp:
         self.failures = 0
 
     def _across(self, toe: int, heel: int) -> Array:
-        """(3,) unit vector to the left of a sole, in its foot frame."""
+        """(3,) m, from a sole's middle line to its left edge, in its foot frame."""
         for p in self._contacts:
             if p.limb == toe:
-                return p.offset / np.linalg.norm(p.offset)
+                return p.offset
         raise AssertionError(heel)
 
     def command(self, now: PlanPoint, ahead: PlanPoint, *, u: Array, q: Array, v: Array) -> JointCommand:
@@ -141,6 +141,12 @@ class WholeBodyQp:
             self._tau = tau
         joints, speeds = self.posture.towards(ahead)
         return JointCommand(joints, speeds, self._tau, self.kp, self.kd)
+
+    def _carried(self) -> Array:
+        """(nj,) bool: joints of the trunk, which carry more than one limb."""
+        model = self.robot.model
+        ends = {model.frames[f].parentJoint for f in self._points}
+        return np.array([sum(j in model.supports[end] for end in ends) > 1 for j in range(2, model.njoints)])
 
     def _solve(self, now: PlanPoint, ahead: PlanPoint, u: Array, q: Array, v: Array) -> Array | None:
         c, body = self.config, self.body
@@ -182,14 +188,18 @@ class WholeBodyQp:
             rows.append((body.jacobian(f)[:3], want - body.drift(f)[:3], np.full(3, w)))
         for (toe, heel), across in self._soles:
             along = positions[toe] - positions[heel]
-            along /= np.linalg.norm(along)
+            length = np.linalg.norm(along)
+            along /= length
             J = along @ body.jacobian(self._points[toe])[3:]
             f = self._points[toe]
-            tilt = (body.placement(f).rotation @ across) @ ground[toe, :3]
+            tilt = (body.placement(f).rotation @ across) @ ground[toe, :3] / np.linalg.norm(across)
             want = -c.swing_kp * tilt - c.swing_kd * (along @ body.velocity(f)[3:]) - along @ body.drift(f)[3:]
-            w = c.stance if stance[toe] or stance[heel] else c.swing
-            rows.append((J[None], np.array([want]), np.array([w * c.roll])))
+            # As if the sole's edges, and in the air something as far aside as its ends, had to be where they should.
+            standing = stance[toe] or stance[heel]
+            w = c.stance * float(across @ across) if standing else c.swing * length**2
+            rows.append((J[None], np.array([want]), np.array([w])))
 
+        self._w0 = np.concatenate([r[1] for r in rows])
         J, want, w = (np.concatenate([r[k] for r in rows]) for k in range(3))
         G = J @ A
         g = want - J @ a0
@@ -198,8 +208,8 @@ class WholeBodyQp:
         # Posture and forces have diagonal Hessians.
         q_ref, v_ref = self.posture.at(now.t)
         posture = c.posture_kp * (q_ref - q[7:]) + c.posture_kd * (v_ref - v[6:])
-        H[range(nj), range(nj)] += c.posture
-        f0[:nj] -= c.posture * posture
+        H[range(nj), range(nj)] += self._posture_weight
+        f0[:nj] -= self._posture_weight * posture
         share = np.bincount([p.limb for p in contacts], minlength=len(self._points))
         planned = u + np.outer(self.model.foot_mass, [0, 0, self.model.g])
         force = np.array([planned[p.limb] / share[p.limb] for p in contacts]).reshape(-1)
@@ -221,7 +231,7 @@ class WholeBodyQp:
             return None
         if flag not in SOLVED or not np.all(np.isfinite(x)):
             return None
-        self.solution = dict(a=a0 + A @ x, f=x[nj:].reshape(-1, 3), contacts=contacts)
+        self.solution = dict(a=a0 + A @ x, f=x[nj:].reshape(-1, 3), contacts=contacts, a_err=(J @ (a0 + A @ x) - self._w0)[:6])
         return np.clip(t0 + T @ x, -effort, effort)
 
     def _friction(self, contacts, ground: Array, nj: int) -> Array:
