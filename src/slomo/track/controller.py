@@ -13,7 +13,9 @@ from slomo.track.lead_in import with_lead_in
 from slomo.track.open_loop import STIFFER
 from slomo.track.plan import Plan
 from slomo.track.planner import make_planner
+from slomo.track.posture import standing_pose
 from slomo.track.sensors import SensorSample
+from slomo.track.whole_body_qp import WholeBodyQp
 
 Array = np.ndarray
 
@@ -48,6 +50,10 @@ class Controller:
         self.planner = make_planner(config.controller, model, self.reference, terrain=terrain, config=config)
         kp, kd = STIFFER if config.controller == "open-loop" else (1.0, 1.0)
         self.joints = JointSpace(robot, kp=kp * config.kp, kd=kd * config.kd)
+        layer = config.joint_layer if config.joint_layer != "auto" else "qp" if robot.kind == "humanoid" else "ik"
+        self.layer = self.joints
+        if layer == "qp" and config.controller != "open-loop":
+            self.layer = WholeBodyQp(robot, self.reference, terrain=terrain, mu=config.mu)
         self.estimator = Estimator(robot, terrain)
         self.plan: Plan | None = None
         self._begin()
@@ -55,8 +61,7 @@ class Controller:
     @property
     def first_pose(self) -> Array:
         """(nq,) in which the reference begins, standing."""
-        self.joints.reset()
-        return self.joints.pose(self.reference.q[0])
+        return standing_pose(self.robot, self.reference.q[0])
 
     def warm_up(self) -> float:
         """Compile everything that runs later; returns the seconds."""
@@ -98,9 +103,10 @@ class Controller:
             period = 1 / self.config.mpc_hz
             self._due += period * max(1.0, np.floor((t - self._due) / period + 1e-3) + 1)
         u = self.plan.feedback(t, q_point, v_point)
-        return self.joints.command(self.plan.at(t), self.plan.at(t + self.config.lookahead), u=u, q=q, v=v)
+        return self.layer.command(self.plan.at(t), self.plan.at(t + self.config.lookahead), u=u, q=q, v=v)
 
     def _begin(self) -> None:
         self.plan, self._due = None, float(self.reference.t[0])
         self.planner.reset()
+        self.layer.reset()
         self._true: tuple[Array, Array] | None = None

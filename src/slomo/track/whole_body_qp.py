@@ -21,6 +21,7 @@ from slomo.motion import Reference
 from slomo.pointfoot import PointFootModel
 from slomo.robot import Robot
 from slomo.terrain import Terrain
+from slomo.track.actuators import torque_limits
 from slomo.track.floating_base import FloatingBase
 from slomo.track.joint_space import JointCommand
 from slomo.track.plan import PlanPoint
@@ -79,7 +80,6 @@ class WholeBodyQp:
         reference: with the lead-in; its joint angles are the posture.
         terrain: ground under the feet's frames, in the reference's world.
         mu: friction coefficient to reckon with.
-        armature: kg m2, as in `FloatingBase`.
         config: weights and gains.
 
     Attributes:
@@ -93,12 +93,11 @@ class WholeBodyQp:
         *,
         terrain: Terrain,
         mu: float,
-        armature: Array | float,
         config: QpConfig | None = None,
     ):
         self.robot, self.terrain, self.config = robot, terrain, config or QpConfig()
         self.mu = mu / np.sqrt(2)  # the pyramid within the cone
-        self.body = FloatingBase(robot, armature)
+        self.body = FloatingBase(robot, robot.rotor_inertia)
         self.model = PointFootModel.from_robot(robot)
         self.posture = Posture(robot, reference)
         self._base = robot.model.getFrameId(robot.base)
@@ -220,9 +219,9 @@ class WholeBodyQp:
         lower, upper = self._acceleration_bounds(q[7:], v[6:])
         cone = self._friction(contacts, ground, nj)
         big = np.full(3 * len(contacts), 1e6)
-        effort = self.robot.effort
-        high = np.concatenate([upper, big, effort - t0, np.full(len(cone), 1e6)])
-        low = np.concatenate([lower, -big, -effort - t0, np.zeros(len(cone))])
+        weakest, strongest = torque_limits(self.robot, v[6:])
+        high = np.concatenate([upper, big, strongest - t0, np.full(len(cone), 1e6)])
+        low = np.concatenate([lower, -big, weakest - t0, np.zeros(len(cone))])
         sense = np.zeros(len(high), np.int32)
         sense[:nj] = SOFT
         try:
@@ -232,7 +231,7 @@ class WholeBodyQp:
         if flag not in SOLVED or not np.all(np.isfinite(x)):
             return None
         self.solution = dict(a=a0 + A @ x, f=x[nj:].reshape(-1, 3), contacts=contacts, a_err=(J @ (a0 + A @ x) - self._w0)[:6])
-        return np.clip(t0 + T @ x, -effort, effort)
+        return np.clip(t0 + T @ x, weakest, strongest)
 
     def _friction(self, contacts, ground: Array, nj: int) -> Array:
         """(5 K, n) rows that are not negative for forces within the pyramids about the ground's normals."""
