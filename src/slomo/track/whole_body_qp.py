@@ -48,6 +48,7 @@ class QpConfig:
         loaded: share of the weight above which a planned force makes a contact.
         near: m over the ground, up to which a foot can be in contact.
         margin: s, within which a joint may come to a stop at its limit.
+        hold: s, after which the motor PD's targets are where the accelerations lead.
         frequency: rad/s, and damping: of the motor PD of a joint alone: kp = I w^2, kd = 2 damping I w.
     """
 
@@ -68,6 +69,7 @@ class QpConfig:
     near: float = 0.012
     still: float = 0.1
     margin: float = 0.05
+    hold: float = 0.01
     frequency: float = 20.0
     damping: float = 1.0
 
@@ -105,6 +107,7 @@ class WholeBodyQp:
         self._hand = np.array([limb.is_hand for limb in robot.limbs])
         self._contacts = contact_points(robot)
         self._soles = [(p, self._across(*p)) for p in robot.pairs]
+        self._determined = len(robot.joint_names) == 3 * len(robot.limbs)
         self._raise = np.array([0.0, 0.0, robot.foot_radius])
         data = self.body.model.createData()
         inertia = np.diag(pin.crba(self.body.model, data, robot.q_nominal))[6:]
@@ -116,6 +119,7 @@ class WholeBodyQp:
     def reset(self) -> None:
         """Forget the last torques."""
         self._tau = np.zeros(len(self.robot.effort))
+        self._acceleration = np.zeros_like(self._tau)
         self.failures = 0
 
     def _across(self, toe: int, heel: int) -> Array:
@@ -133,12 +137,13 @@ class WholeBodyQp:
             u: (C, 3) N, world, forces of the feet on the body, with feedback.
             q: (nq,) and v: (nv,), the whole robot in Pinocchio's convention.
         """
-        tau = self._solve(now, ahead, u, q, v)
-        if tau is None:
+        if not self._solve(now, ahead, u, q, v):
             self.failures += 1
+        if self._determined:
+            joints, speeds = self.posture.towards(ahead)
         else:
-            self._tau = tau
-        joints, speeds = self.posture.towards(ahead)
+            h, a = self.config.hold, self._acceleration
+            joints, speeds = q[7:] + h * v[6:] + h * h / 2 * a, v[6:] + h * a
         return JointCommand(joints, speeds, self._tau, self.kp, self.kd)
 
     def _carried(self) -> Array:
@@ -147,7 +152,7 @@ class WholeBodyQp:
         ends = {model.frames[f].parentJoint for f in self._points}
         return np.array([sum(j in model.supports[end] for end in ends) > 1 for j in range(2, model.njoints)])
 
-    def _solve(self, now: PlanPoint, ahead: PlanPoint, u: Array, q: Array, v: Array) -> Array | None:
+    def _solve(self, now: PlanPoint, ahead: PlanPoint, u: Array, q: Array, v: Array) -> bool:
         c, body = self.config, self.body
         body.update(q, v)
         weight = self.robot.mass * self.model.g
@@ -227,11 +232,12 @@ class WholeBodyQp:
         try:
             x, _, flag, _ = daqp.solve(H, f0, np.vstack([T, cone]), high, low, sense)
         except ValueError:
-            return None
+            return False
         if flag not in SOLVED or not np.all(np.isfinite(x)):
-            return None
+            return False
         self.solution = dict(a=a0 + A @ x, f=x[nj:].reshape(-1, 3), contacts=contacts, a_err=(J @ (a0 + A @ x) - self._w0)[:6])
-        return np.clip(t0 + T @ x, weakest, strongest)
+        self._tau, self._acceleration = np.clip(t0 + T @ x, weakest, strongest), x[:nj]
+        return True
 
     def _friction(self, contacts, ground: Array, nj: int) -> Array:
         """(5 K, n) rows that are not negative for forces within the pyramids about the ground's normals."""
