@@ -11,7 +11,6 @@ from slomo.retarget.footprint import Footprint, footprint
 from slomo.retarget.soles import RobotBody
 from slomo.retarget.subject import Subject
 from slomo.retarget.trunk import Trunk
-from slomo.retarget.turns import at, in_turn
 from slomo.stage import Progress
 
 if TYPE_CHECKING:
@@ -101,11 +100,6 @@ def grounded(
         [feet.anchor(p[:, None], on)[:, 0] for p, on in zip(pointing.T, standing.T, strict=True)]
     )
     lift = np.stack([feet.clear(z, on, least=clearance) for z, on in zip(lift.T, standing.T, strict=True)], axis=1)
-    if subject.fixed and standing.shape[1] == 2:
-        frame, turned = in_turn(standing, dt=dt)
-        if np.any(turned != standing):
-            progress.note("both feet are in the air for longer than a jump lasts: they step one after the other")
-        soles, lift, pointing, standing = at(soles, frame), at(lift, frame), at(pointing, frame), turned
     airborne = float(np.mean(~standing[:, known].any(axis=1)))
     report |= {
         "scale": float(scale),

@@ -1,7 +1,7 @@
 """How a motion is entered from standing still.
 
 A reference may begin at speed and with feet in the air, and no robot can. The lead-in stands in the reference's first
-pose with every foot on the ground, then gathers its velocity and lifts the feet that begin in the air. It is a
+pose with every foot on the ground (a humanoid with its weight in the middle of them), then gathers its velocity and lifts the feet that begin in the air. It is a
 kinematic blend with forces of near-static balance, for the controller to follow; it comes before t = 0.
 """
 
@@ -58,6 +58,18 @@ def with_lead_in(
         speeds[:, c, 2] = 6 * s * (1 - s) / SWING * (p[2] - ground)
         stance[:, c] = s <= 0
 
+    if len(model.pairs):
+        # People begin a motion anywhere; a robot begins it over its feet.
+        s = np.clip(1 + t / blend, 0, 1)
+        away = _centred(model, q[0, :3], points[0], stance[0])
+        hands = np.flatnonzero(model.is_hand)
+        there = ((1 - s) ** 2 * (1 + 2 * s))[:, None] * away
+        moving = (-6 * s * (1 - s) / blend)[:, None] * away
+        q[:, :2] += there
+        v[:, :2] += moving
+        points[:, hands, :2] += there[:, None]
+        speeds[:, hands, :2] += moving[:, None]
+
     acceleration = np.gradient(v[:, :3], h, axis=0)
     u = np.array([_balance(model, q[k, :3], points[k], stance[k], acceleration[k]) for k in range(n)])
     lam = np.where(stance[..., None], u + [0, 0, model.g] * model.foot_mass[:, None], 0.0)
@@ -71,6 +83,13 @@ def with_lead_in(
         point_names=reference.point_names,
         robot_digest=reference.robot_digest,
     )
+
+
+def _centred(model: PointFootModel, body: Array, points: Array, stance: Array) -> Array:
+    """(2,) m, how far body and hands have to move for the centre of mass to be over the middle of the feet."""
+    with_body = model.mass + model.foot_mass[model.is_hand].sum()
+    com = (model.mass * body + model.foot_mass @ points) / model.total_mass
+    return (points[stance].mean(axis=0) - com)[:2] * model.total_mass / with_body
 
 
 def _balance(model: PointFootModel, body: Array, points: Array, stance: Array, acceleration: Array) -> Array:

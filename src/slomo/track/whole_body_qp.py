@@ -65,6 +65,7 @@ class QpConfig:
     posture_kp: float = 100.0
     posture_kd: float = 20.0
     force: float = 1e-3
+    balance: float = 0.5
     loaded: float = 0.02
     near: float = 0.012
     still: float = 0.1
@@ -102,6 +103,7 @@ class WholeBodyQp:
         self.body = FloatingBase(robot, robot.rotor_inertia)
         self.model = PointFootModel.from_robot(robot)
         self.posture = Posture(robot, reference)
+        self._reference = reference
         self._base = robot.model.getFrameId(robot.base)
         self._points = [robot.model.getFrameId(name) for name in robot.foot_names]
         self._hand = np.array([limb.is_hand for limb in robot.limbs])
@@ -146,6 +148,19 @@ class WholeBodyQp:
             joints, speeds = q[7:] + h * v[6:] + h * h / 2 * a, v[6:] + h * a
         return JointCommand(joints, speeds, self._tau, self.kp, self.kd)
 
+    def _balance(self, t: float, position: Array, velocity: Array) -> Array:
+        """(2,) m/s^2, what a sole's width can do for the balance, of which a plan with feet without width knows nothing.
+
+        Feedback of the divergent component of motion x + v / w (Takenaka 2009; Englsberger 2015), with w^2 = g / height,
+        towards the reference's.
+        """
+        r, k = self._reference, int(np.clip(np.searchsorted(self._reference.t, t) - 1, 0, len(self._reference.t) - 2))
+        s = (t - r.t[k]) / (r.t[k + 1] - r.t[k])
+        wanted = (1 - s) * r.q[k, :2] + s * r.q[k + 1, :2]
+        w = np.sqrt(self.model.g / self.robot.standing_height)
+        ahead = position[:2] - wanted + (velocity[:2] - r.v[k + 1, :2]) / w
+        return -self.config.balance * w * w * ahead
+
     def _carried(self) -> Array:
         """(nj,) bool: joints of the trunk, which carry more than one limb."""
         model = self.robot.model
@@ -174,6 +189,7 @@ class WholeBodyQp:
         omega = R.T @ body.velocity(self._base)[3:]
         I = self.model.inertia
         linear = u.sum(axis=0) / self.model.mass - [0, 0, self.model.g]
+        linear[:2] += self._balance(now.t, T_world_base.translation, body.velocity(self._base))
         angular = R @ np.linalg.solve(I, R.T @ np.cross(arms, u).sum(axis=0) - np.cross(omega, I @ omega))
         want = np.concatenate([linear, angular]) - body.drift(self._base)
         rows.append((body.jacobian(self._base), want, np.repeat([c.body, c.turn], 3)))
