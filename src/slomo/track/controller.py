@@ -13,6 +13,7 @@ from slomo.track.lead_in import with_lead_in
 from slomo.track.open_loop import STIFFER
 from slomo.track.plan import Plan
 from slomo.track.planner import make_planner
+from slomo.track.posture import standing_pose
 from slomo.track.sensors import SensorSample
 from slomo.track.whole_body_qp import WholeBodyQp
 
@@ -58,8 +59,7 @@ class Controller:
     @property
     def first_pose(self) -> Array:
         """(nq,) in which the reference begins, standing."""
-        self.joints.reset()
-        return self.joints.pose(self.reference.q[0])
+        return standing_pose(self.robot, self.reference.q[0])
 
     def warm_up(self) -> float:
         """Compile everything that runs later; returns the seconds."""
@@ -110,8 +110,7 @@ class Controller:
             return JointSpace(robot, kp=STIFFER[0] * config.kp, kd=STIFFER[1] * config.kd)
         if layer_of(config, robot.kind) == "ik":
             return JointSpace(robot, kp=config.kp, kd=config.kd)
-        rotors = robot.rotor_inertia
-        return WholeBodyQp(robot, self.reference, terrain=self.terrain, mu=config.mu, armature=rotors)
+        return WholeBodyQp(robot, self.reference, terrain=self.terrain, mu=config.mu)
 
     def _begin(self) -> None:
         self.plan, self._due = None, float(self.reference.t[0])

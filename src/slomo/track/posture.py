@@ -15,6 +15,9 @@ class Posture:
 
     Args:
         robot: the robot.  reference: of its point-foot model.
+
+    Attributes:
+        first: (nq,) the robot in the reference's first pose, on the real ground.
     """
 
     def __init__(self, robot: Robot, reference: Reference):
@@ -22,7 +25,8 @@ class Posture:
         motion = joint_motion(robot, reference)
         self._t, self._q = reference.t, motion.q[:, 7:]
         self._v = np.gradient(self._q, self._t, axis=0)
-        self.first = motion.q[0] + np.concatenate([[0, 0, robot.foot_radius], np.zeros(len(motion.q[0]) - 3)])
+        self.first = motion.q[0].copy()
+        self.first[2] += robot.foot_radius
         self._legs = Legs(robot)
 
     def at(self, t: float) -> tuple[Array, Array]:
@@ -40,3 +44,12 @@ class Posture:
         joints = self._legs.solve(root[:7], joints, plan.points, joints, iterations=1)
         q = np.concatenate([root[:7], joints])
         return joints, self._legs.velocities(q, root[7:], speeds, plan.point_velocities.ravel())
+
+
+def standing_pose(robot: Robot, q_point: Array) -> Array:
+    """(nq,) the robot on the real ground with the base and the points of a point-foot configuration (7 + 3 C,)."""
+    legs, nominal = Legs(robot), robot.q_nominal[7:]
+    root = legs.root(q_point, np.zeros(6 + 3 * len(robot.limbs)))[:7]
+    q = np.concatenate([root, legs.solve(root, nominal, q_point[7:].reshape(-1, 3), nominal)])
+    q[2] += robot.foot_radius
+    return q

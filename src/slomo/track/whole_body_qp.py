@@ -21,6 +21,7 @@ from slomo.motion import Reference
 from slomo.pointfoot import PointFootModel
 from slomo.robot import Robot
 from slomo.terrain import Terrain
+from slomo.track.actuators import torque_limits
 from slomo.track.floating_base import FloatingBase
 from slomo.track.joint_space import JointCommand
 from slomo.track.plan import PlanPoint
@@ -42,7 +43,6 @@ class QpConfig:
         stance: feet on the ground stay; stance_kd: 1/s, how their motion dies out.
         swing, swing_kp, swing_kd: feet in the air follow the plan.
         hand: hands do, with the same gains.
-        roll: a sole's tilt sideways.
         posture, posture_kp, posture_kd: all joints, towards the reference's angles.
         force: of forces as accelerations (f / robot mass), towards the planned ones.
         loaded: share of the weight above which a planned force makes a contact.
@@ -59,8 +59,8 @@ class QpConfig:
     swing_kp: float = 300.0
     swing_kd: float = 25.0
     hand: float = 0.03
-    roll: float = 0.03
     posture: float = 1e-3
+    trunk: float = 0.3
     posture_kp: float = 100.0
     posture_kd: float = 20.0
     force: float = 1e-3
@@ -80,7 +80,6 @@ class WholeBodyQp:
         reference: with the lead-in; its joint angles are the posture.
         terrain: ground under the feet's frames, in the reference's world.
         mu: friction coefficient to reckon with.
-        armature: kg m2, as in `FloatingBase`.
         config: weights and gains.
 
     Attributes:
@@ -94,12 +93,11 @@ class WholeBodyQp:
         *,
         terrain: Terrain,
         mu: float,
-        armature: Array | float,
         config: QpConfig | None = None,
     ):
         self.robot, self.terrain, self.config = robot, terrain, config or QpConfig()
         self.mu = mu / np.sqrt(2)  # the pyramid within the cone
-        self.body = FloatingBase(robot, armature)
+        self.body = FloatingBase(robot, robot.rotor_inertia)
         self.model = PointFootModel.from_robot(robot)
         self.posture = Posture(robot, reference)
         self._base = robot.model.getFrameId(robot.base)
@@ -111,6 +109,7 @@ class WholeBodyQp:
         data = self.body.model.createData()
         inertia = np.diag(pin.crba(self.body.model, data, robot.q_nominal))[6:]
         c = self.config
+        self._posture_weight = np.where(self._carried(), c.trunk, c.posture)
         self.kp, self.kd = inertia * c.frequency**2, 2 * c.damping * inertia * c.frequency
         self.reset()
 
@@ -120,10 +119,10 @@ class WholeBodyQp:
         self.failures = 0
 
     def _across(self, toe: int, heel: int) -> Array:
-        """(3,) unit vector to the left of a sole, in its foot frame."""
+        """(3,) m, from a sole's middle line to its left edge, in its foot frame."""
         for p in self._contacts:
             if p.limb == toe:
-                return p.offset / np.linalg.norm(p.offset)
+                return p.offset
         raise AssertionError(heel)
 
     def command(self, now: PlanPoint, ahead: PlanPoint, *, u: Array, q: Array, v: Array) -> JointCommand:
@@ -141,6 +140,12 @@ class WholeBodyQp:
             self._tau = tau
         joints, speeds = self.posture.towards(ahead)
         return JointCommand(joints, speeds, self._tau, self.kp, self.kd)
+
+    def _carried(self) -> Array:
+        """(nj,) bool: joints of the trunk, which carry more than one limb."""
+        model = self.robot.model
+        ends = {model.frames[f].parentJoint for f in self._points}
+        return np.array([sum(j in model.supports[end] for end in ends) > 1 for j in range(2, model.njoints)])
 
     def _solve(self, now: PlanPoint, ahead: PlanPoint, u: Array, q: Array, v: Array) -> Array | None:
         c, body = self.config, self.body
@@ -182,14 +187,18 @@ class WholeBodyQp:
             rows.append((body.jacobian(f)[:3], want - body.drift(f)[:3], np.full(3, w)))
         for (toe, heel), across in self._soles:
             along = positions[toe] - positions[heel]
-            along /= np.linalg.norm(along)
+            length = np.linalg.norm(along)
+            along /= length
             J = along @ body.jacobian(self._points[toe])[3:]
             f = self._points[toe]
-            tilt = (body.placement(f).rotation @ across) @ ground[toe, :3]
+            tilt = (body.placement(f).rotation @ across) @ ground[toe, :3] / np.linalg.norm(across)
             want = -c.swing_kp * tilt - c.swing_kd * (along @ body.velocity(f)[3:]) - along @ body.drift(f)[3:]
-            w = c.stance if stance[toe] or stance[heel] else c.swing
-            rows.append((J[None], np.array([want]), np.array([w * c.roll])))
+            # As if the sole's edges, and in the air something as far aside as its ends, had to be where they should.
+            standing = stance[toe] or stance[heel]
+            w = c.stance * float(across @ across) if standing else c.swing * length**2
+            rows.append((J[None], np.array([want]), np.array([w])))
 
+        self._w0 = np.concatenate([r[1] for r in rows])
         J, want, w = (np.concatenate([r[k] for r in rows]) for k in range(3))
         G = J @ A
         g = want - J @ a0
@@ -198,8 +207,8 @@ class WholeBodyQp:
         # Posture and forces have diagonal Hessians.
         q_ref, v_ref = self.posture.at(now.t)
         posture = c.posture_kp * (q_ref - q[7:]) + c.posture_kd * (v_ref - v[6:])
-        H[range(nj), range(nj)] += c.posture
-        f0[:nj] -= c.posture * posture
+        H[range(nj), range(nj)] += self._posture_weight
+        f0[:nj] -= self._posture_weight * posture
         share = np.bincount([p.limb for p in contacts], minlength=len(self._points))
         planned = u + np.outer(self.model.foot_mass, [0, 0, self.model.g])
         force = np.array([planned[p.limb] / share[p.limb] for p in contacts]).reshape(-1)
@@ -210,9 +219,9 @@ class WholeBodyQp:
         lower, upper = self._acceleration_bounds(q[7:], v[6:])
         cone = self._friction(contacts, ground, nj)
         big = np.full(3 * len(contacts), 1e6)
-        effort = self.robot.effort
-        high = np.concatenate([upper, big, effort - t0, np.full(len(cone), 1e6)])
-        low = np.concatenate([lower, -big, -effort - t0, np.zeros(len(cone))])
+        weakest, strongest = torque_limits(self.robot, v[6:])
+        high = np.concatenate([upper, big, strongest - t0, np.full(len(cone), 1e6)])
+        low = np.concatenate([lower, -big, weakest - t0, np.zeros(len(cone))])
         sense = np.zeros(len(high), np.int32)
         sense[:nj] = SOFT
         try:
@@ -221,8 +230,10 @@ class WholeBodyQp:
             return None
         if flag not in SOLVED or not np.all(np.isfinite(x)):
             return None
-        self.solution = dict(a=a0 + A @ x, f=x[nj:].reshape(-1, 3), contacts=contacts)
-        return np.clip(t0 + T @ x, -effort, effort)
+        self.solution = dict(
+            a=a0 + A @ x, f=x[nj:].reshape(-1, 3), contacts=contacts, a_err=(J @ (a0 + A @ x) - self._w0)[:6]
+        )
+        return np.clip(t0 + T @ x, weakest, strongest)
 
     def _friction(self, contacts, ground: Array, nj: int) -> Array:
         """(5 K, n) rows that are not negative for forces within the pyramids about the ground's normals."""
