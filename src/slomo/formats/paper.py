@@ -149,9 +149,7 @@ def _person(
     return KeypointMotion(t=t, positions=positions, names=names, confidence=np.ones(positions.shape[:2]))
 
 
-def _unrolled(
-    root: Array, hands: Array, feet: Array, ahead: Array, note: Callable[[str], None]
-) -> tuple[Array, Array]:
+def _unrolled(root: Array, hands: Array, feet: Array, ahead: Array, note: Callable[[str], None]) -> tuple[Array, Array]:
     """Hands and feet (T, 2, 3) turned about the body's forward axis, where a body that never moves hides its roll.
 
     In the plane of left and up, as complex numbers, a pair is turned by the angle a that makes its left l and right r

@@ -170,9 +170,7 @@ class Legs:
             error[k] = self.error[: points[k].size].reshape(-1, 3)
         return joints, error
 
-    def solve(
-        self, root: Array, joints: Array, points: Array, home: Array, *, iterations: int = ITERATIONS
-    ) -> Array:
+    def solve(self, root: Array, joints: Array, points: Array, home: Array, *, iterations: int = ITERATIONS) -> Array:
         """(nj,) rad that bring the contact frames to points (C, 3), from a first guess, with the root at (7,)."""
         lower, upper, scale = self.robot.lower, self.robot.upper, self._scale
         q = np.concatenate([root, joints])

@@ -1,7 +1,6 @@
 """Joint angles along a reference, and towards a plan that has left it."""
 
 import numpy as np
-import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
 from slomo.motion import Reference
 from slomo.optimize.inverse import Legs, joint_motion

@@ -80,9 +80,7 @@ def _shape_points(robot: Robot, frame: int) -> Array:
     """(N, 3) m, corners of the collision shapes that move with a frame, in its joint's frame."""
     model = robot.model
     joint = model.frames[frame].parentJoint
-    placements = {
-        f.name: f.placement for f in model.frames if f.type == pin.FrameType.BODY and f.parentJoint == joint
-    }
+    placements = {f.name: f.placement for f in model.frames if f.type == pin.FrameType.BODY and f.parentJoint == joint}
     out = [np.zeros((0, 3))]
     for link in ET.parse(robot.urdf).iterfind("link"):
         if link.get("name") not in placements:

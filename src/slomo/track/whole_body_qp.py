@@ -1,6 +1,6 @@
 """Whole-body quadratic program: from the plan of the point-foot model to torques of all joints.
 
-At every joint tick, the joint accelerations and contact forces x = (a_j, f) that come nearest to what the plan asks for,
+At every joint tick, the joint accelerations and contact forces x = (a_j, f) that come nearest to what the plan asks,
 
     min  sum_i w_i |J_i a(x) + dJ_i v - a_i*|^2 + w_f |f - f*|^2
     such that  |tau(x)| <= effort,   f in the friction pyramids,   joint limits as bounds of a_j (soft),
@@ -187,10 +187,10 @@ class WholeBodyQp:
         R = T_world_base.rotation
         arms = positions + self._raise - T_world_base.translation
         omega = R.T @ body.velocity(self._base)[3:]
-        I = self.model.inertia
+        inertia = self.model.inertia
         linear = u.sum(axis=0) / self.model.mass - [0, 0, self.model.g]
         linear[:2] += self._balance(now.t, T_world_base.translation, body.velocity(self._base))
-        angular = R @ np.linalg.solve(I, R.T @ np.cross(arms, u).sum(axis=0) - np.cross(omega, I @ omega))
+        angular = R @ np.linalg.solve(inertia, R.T @ np.cross(arms, u).sum(axis=0) - np.cross(omega, inertia @ omega))
         want = np.concatenate([linear, angular]) - body.drift(self._base)
         rows.append((body.jacobian(self._base), want, np.repeat([c.body, c.turn], 3)))
         # Feet and hands.
