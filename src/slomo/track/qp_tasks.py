@@ -25,6 +25,7 @@ class QpConfig:
         body, turn: linear and angular acceleration of the body, as planned.
         balance: feedback of soles that have a width, see `Tasks.balance`.
         stance: feet on the ground stay; stance_kd: 1/s, how their motion dies out.
+        landing: feet in the air that should bear load come down; landing_frequency: rad/s, how fast, critically damped.
         swing, swing_kp, swing_kd: feet in the air follow the plan.
         hand: hands do, with the same gains.
         posture, posture_kp, posture_kd: joints, towards the reference's angles.  trunk: weight of those that carry
@@ -43,9 +44,11 @@ class QpConfig:
     balance: float = 0.3
     stance: float = 10.0
     stance_kd: float = 20.0
+    landing: float = 3.0
+    landing_frequency: float = 30.0
     swing: float = 0.3
     swing_kp: float = 300.0
-    swing_kd: float = 25.0
+    swing_kd: float = 40.0
     hand: float = 0.03
     posture: float = 1e-3
     trunk: float = 0.3
@@ -64,12 +67,14 @@ class QpConfig:
 @dataclass(frozen=True)
 class View:
     """The points as they are: positions, velocities (C, 3) m, m/s in the reference's world; ground (C, 4) planes under
-    them (`Terrain.planes`); stance (C,) bool; the contacts of those that stand."""
+    them (`Terrain.planes`); stance (C,) bool; late (C,) bool, that should bear load and are in the air; the contacts of
+    those that stand."""
 
     positions: Array
     velocities: Array
     ground: Array
     stance: Array
+    late: Array
     contacts: list[ContactPoint]
 
 
@@ -107,7 +112,8 @@ class Tasks:
         loaded = now.lam[:, 2] > c.loaded * self.robot.mass * self.model.g
         stays = np.linalg.norm(ahead.points - now.points, axis=1) < c.still * _between(now, ahead)
         stance = (loaded | stays) & (gap < c.near) & ~self.model.is_hand
-        return View(positions, velocities, ground, stance, [p for p in self._contacts if stance[p.limb]])
+        late = loaded & ~stance & ~self.model.is_hand
+        return View(positions, velocities, ground, stance, late, [p for p in self._contacts if stance[p.limb]])
 
     def motion(self, view: View, now: PlanPoint, ahead: PlanPoint, u: Array) -> tuple[Array, Array, Array]:
         """Jacobians (k, nv), the accelerations J a that are wanted (k,), less what velocities make, weights (k,)."""
@@ -151,6 +157,10 @@ class Tasks:
         for i, f in enumerate(self._points):
             if view.stance[i]:
                 want, w = -c.stance_kd * view.velocities[i], c.stance
+            elif view.late[i]:
+                n, d = view.ground[i, :3], c.landing_frequency
+                down = d * d * (n @ view.positions[i] - view.ground[i, 3])
+                want, w = -2 * d * view.velocities[i] - down * n, c.landing
             else:
                 w = c.hand if self.model.is_hand[i] else c.swing
                 off, slow = now.points[i] - view.positions[i], now.point_velocities[i] - view.velocities[i]
