@@ -1,6 +1,6 @@
 """The controller and the simulated robot, each at its rate."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from slomo.track.controller import Controller
 from slomo.track.disturbance import Disturbance
 from slomo.track.joint_space import JointSpace
 from slomo.track.plan import PlanPoint
+from slomo.track.posture import standing_pose
 from slomo.track.recording import Recording, reference_at
 from slomo.track.sensors import SensorSample, SimulatedSensors
 from slomo.track.simulation import Simulation
@@ -124,10 +125,11 @@ def _stand(simulation: Simulation, reference: Reference, terrain: Terrain, groun
     q[2] += higher[robot.feet].mean()
     # Four times the effort a radian: a few millimetres of sag in any robot.
     joints = JointSpace(robot, kp=4 * robot.effort, kd=0.13 * robot.effort)
-    pose = joints.pose(q)
+    pose = standing_pose(robot, q)
     zero = np.zeros_like(reference.points[0])
     point = PlanPoint(q[:3], q[3:7], np.zeros(3), np.zeros(3), q[7:].reshape(-1, 3), zero, zero, zero)
     command = joints.command(point, point, u=reference.u[0].reshape(-1, 3), q=pose, v=np.zeros(robot.model.nv))
+    command = replace(command, q=pose[7:])
     motors = Motors(robot)
     motors.send(0.0, command)
     simulation.reset(pose)

@@ -11,7 +11,7 @@ from slomo.robot import Robot
 from slomo.stage import Arrays, Artifact, Inputs, Progress
 from slomo.terrain import Terrain
 from slomo.track import metrics
-from slomo.track.config import Config, check
+from slomo.track.config import Config, check, layer_of
 from slomo.track.disturbance import Disturbance
 from slomo.track.loop import simulate
 
@@ -60,13 +60,20 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
         "simulated_seconds": float(rollout.t[-1] - rollout.t[0]),
         "wall_seconds": perf_counter() - start,
         "compile_seconds": outcome.compile_seconds,
-        "method": f"MPC (H = {config.horizon}, {config.mpc_hz} Hz), inverse kinematics + PD + J^T forces, MuJoCo",
+        "method": _method(config, robot),
     }
     return Artifact(
         npz={"rollout.npz": rollout.to_arrays()},
         json={"metrics.json": report},
         failure=f"{robot.name} fell: {outcome.fall}" if outcome.fall else None,
     )
+
+
+def _method(config: Config, robot: Robot) -> str:
+    """In words, what ran."""
+    layers = {"ik": "inverse kinematics + PD + J^T forces", "qp": "whole-body QP + PD"}
+    planner = f"{config.controller} (H = {config.horizon}, {config.mpc_hz} Hz)"
+    return f"{planner}, {layers[layer_of(config, robot.kind)]}, {config.state} state, MuJoCo"
 
 
 def reference_digest(arrays: Arrays) -> str:
