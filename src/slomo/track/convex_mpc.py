@@ -146,7 +146,7 @@ class ConvexMpc:
         h = np.full(H, c.dt)
         h[-1] += c.terminal
         w = (h[:, None] * self._w_x).ravel()
-        effort = c.dt * c.effort
+        effort = c.dt * c.effort / (self._mass.sum() * self.model.g) ** 2
         P = S.T @ (w[:, None] * S) + effort * np.eye(len(used))
         g = S.T @ (w * (free - x_ref.ravel())) - effort * forces_ref.ravel()[used]
         n, mu = len(used) // 3, c.mu
