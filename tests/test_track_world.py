@@ -6,9 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
+from slomo.cli import app
 from slomo.errors import UsageError
 from slomo.motion import Reference
+from slomo.pipeline import Project
 from slomo.pointfoot import GRAVITY
 from slomo.robot import load_robot
 from slomo.terrain import Box, HeightField, Slope, Terrain
@@ -175,3 +178,27 @@ def test_a_cycle_goes_on_where_it_ended():
 def test_only_cycles_repeat():
     with pytest.raises(UsageError, match="--cyclic"):
         repeated(dataclasses.replace(turning(), cycle=np.zeros(0)), 5.0)
+
+
+def test_options_of_the_command_reach_the_stage(tmp_path):
+    """There is nothing to track here, but what is asked for is written down first."""
+    ground = tmp_path / "ground.json"
+    ground.write_text('{"slopes": [{"x_min": 0, "x_max": 1, "y_min": 0, "y_max": 1, "slope_x": 0.1}]}')
+
+    def call(*options):
+        args = ["track", "--sim", "--robot", "go1", "--project", str(tmp_path), *options]
+        assert CliRunner().invoke(app, args).exit_code == 3
+        return Project(tmp_path, "go1")
+
+    project = call(
+        "--push", "12@1.5,90", "--push", "3@2,0", "--payload", "2.5", "--latency", "0.01", "--friction", "0.4",
+        "--state", "truth", "--seconds", "60", "--terrain", str(ground),
+    )  # fmt: skip
+    config = project.config("track")
+    want = Disturbance(payload=2.5, pushes=(Push(12, 1.5, 90), Push(3, 2, 0)), latency=0.01)
+    assert config.disturbance() == want
+    assert (config.friction, config.state, config.seconds) == (0.4, "truth", 60.0)
+    assert Terrain.load(project.files("track")["world"]).slopes[0].slope_x == 0.1
+    project = call("--push", "none", "--terrain", "none")
+    assert project.config("track").disturbance().pushes == ()
+    assert project.files("track") == {}

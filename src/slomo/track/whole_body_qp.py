@@ -251,7 +251,9 @@ class WholeBodyQp:
             return False
         if flag not in SOLVED or not np.all(np.isfinite(x)):
             return False
-        self.solution = dict(a=a0 + A @ x, f=x[nj:].reshape(-1, 3), contacts=contacts, a_err=(J @ (a0 + A @ x) - self._w0)[:6])
+        self.solution = dict(
+            a=a0 + A @ x, f=x[nj:].reshape(-1, 3), contacts=contacts, a_err=(J @ (a0 + A @ x) - self._w0)[:6]
+        )
         self._tau, self._acceleration = np.clip(t0 + T @ x, weakest, strongest), x[:nj]
         return True
 
