@@ -22,7 +22,7 @@ SIZE = 15 + 3 * N
 
 def random_state(seed):
     rng = np.random.default_rng(seed)
-    R = Rotation.random(random_state=seed).as_matrix()
+    R = Rotation.random(rng=seed).as_matrix()
     return R, rng.normal(size=3), rng.normal(size=3), rng.normal(size=(N, 3)), 0.1 * rng.normal(size=6)
 
 
@@ -87,7 +87,7 @@ def test_transition_is_the_derivative_of_the_propagation(seed):
         np.testing.assert_allclose(error(moved, after) / 1e-3, G[:, i] * dt, atol=1e-5, err_msg=str(i))
 
 
-@pytest.mark.parametrize("measure", ["legs", "height", "gyro"])
+@pytest.mark.parametrize("measure", ["legs", "height"])
 def test_a_precise_measurement_removes_the_error_that_it_sees(measure):
     true, rng = random_state(7), np.random.default_rng(7)
     xi = np.concatenate([0.01 * rng.normal(size=SIZE - 6), np.zeros(6)])
@@ -98,15 +98,10 @@ def test_a_precise_measurement_removes_the_error_that_it_sees(measure):
         before = np.abs(estimate[3] - estimate[2] - h @ estimate[0].T).max()
         inekf.correct_legs(*estimate, P, h, 1e-6)
         after = np.abs(estimate[3] - estimate[2] - h @ estimate[0].T).max()
-    elif measure == "height":
+    else:
         before = abs(estimate[3][1, 2] - true[3][1, 2])
         inekf.correct_height(*estimate, P, 1, true[3][1, 2], 1e-6)
         after = abs(estimate[3][1, 2] - true[3][1, 2])
-    else:
-        gyro = estimate[4][:3] + 0.01
-        before = 0.01
-        inekf.correct_gyro_bias(*estimate, P, gyro, 1e-6)
-        after = np.abs(estimate[4][:3] - gyro).max()
     assert after < 0.02 * before
     assert np.linalg.eigvalsh(P).min() > -1e-12
     assert np.trace(P) < 1e-4 * SIZE

@@ -50,7 +50,8 @@ def test_a_command_counts_when_it_has_arrived():
 
 
 def test_sensors_are_late_biased_and_noisy_and_the_same_again():
-    true = [SensorSample(0.001 * k, *(np.full(12, float(k)),) * 3, np.zeros(3), np.zeros(3)) for k in range(2000)]
+    nothing, x = np.zeros(3), np.ones(12)
+    true = [SensorSample(0.001 * k, k * x, k * x, k * x, nothing, nothing) for k in range(2000)]
     late = SimulatedSensors(12, seed=3, errors=SensorErrors(0, 0, 0, 0, 0, 0, 0, 0, 0, delay=0.004))
     read = [late.read(s) for s in true[:50]]
     assert [r.t for r in read[:4]] == [0.0] * 4
