@@ -19,6 +19,9 @@ from slomo.track.whole_body_qp import WholeBodyQp
 
 Array = np.ndarray
 
+# s: how soon a standing foot tells where the ground is, and how soon that is forgotten in the air.
+FEELING, FORGETTING = 0.05, 0.3
+HIGHEST = 0.06  # m, by which the ground may be off
 STANDING = 3.0  # N, of planned force from which a point is planned to stand
 
 
@@ -33,6 +36,7 @@ class Controller:
     Attributes:
         reference: with the lead-in; it begins at reference.t[0] < 0, on the controller's clock.
         plan: the last one, None before the first tick.
+        shift: (C,) m, how much higher than planned the ground under each point is found to be.
         point_state: ((7 + 3 C,), (6 + 3 C,)) the state from which the last command was made, as in `motion.Reference`.
     """
 
@@ -97,7 +101,8 @@ class Controller:
         q, v = self.estimate(t)
         self.point_state = q_point, v_point = self.joints.state(q, v)
         if self.plan is None or t >= self._due - 1e-6:
-            self.plan = self.planner.step(t, q_point, v_point)
+            self._feel_ground(q_point)
+            self.plan = self.planner.step(t, q_point, v_point, shift=self.shift)
             period = 1 / self.config.mpc_hz
             self._due += period * max(1.0, np.floor((t - self._due) / period + 1e-3) + 1)
         u = self.plan.feedback(t, q_point, v_point)
@@ -112,7 +117,16 @@ class Controller:
             return JointSpace(robot, kp=config.kp, kd=config.kd)
         return WholeBodyQp(robot, self.reference, terrain=self.terrain, mu=config.mu)
 
+    def _feel_ground(self, q_point: Array) -> None:
+        """Let `shift` follow the standing feet: the ground is where they are."""
+        points = q_point[7:].reshape(-1, 3)
+        off = np.clip(points[:, 2] - self.terrain.height(points), -HIGHEST, HIGHEST)
+        step = 1 / self.config.mpc_hz
+        stands = self.estimator.contact > 0.9
+        self.shift += np.where(stands, step / FEELING * (off - self.shift), -step / FORGETTING * self.shift)
+
     def _begin(self) -> None:
+        self.shift = np.zeros(len(self.robot.limbs))
         self.plan, self._due = None, float(self.reference.t[0])
         self.planner.reset()
         self.layer.reset()

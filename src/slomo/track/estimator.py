@@ -21,6 +21,9 @@ from slomo.track.sensors import SensorSample
 
 Array = np.ndarray
 
+STILL = 0.05  # rad/s, joint speed under which a robot on all its feet stands still
+SLOW = 0.05  # s, over which that speed is averaged
+
 
 @dataclass(frozen=True)
 class Tuning:
@@ -31,6 +34,7 @@ class Tuning:
         gyro_walk, accelerometer_walk: of the biases, rad/s/sqrt(s) and m/s^2/sqrt(s).
         leg: m, of where kinematics have a foot.
         stance: m/sqrt(s), how a standing foot wanders.  swing: the same of one in the air, which then tells nothing.
+        rest: rad/s, of a gyro's sample while the robot stands still, which shows the bias.
         ground: m, of the terrain's height where a foot comes down. Each touchdown pulls this softly, once.
         tilt: rad, gyro_bias: rad/s, accelerometer_bias: m/s^2, height: m, speed: m/s, in the beginning.
     """
@@ -42,6 +46,7 @@ class Tuning:
     leg: float = 2e-3
     stance: float = 5e-3
     swing: float = 3.0
+    rest: float = 0.02
     ground: float = 0.02
     tilt: float = 0.02
     gyro_bias: float = 0.02
@@ -116,6 +121,7 @@ class Estimator:
         P[n - 3 :, n - 3 :] = tuning.accelerometer_bias**2 * np.eye(3)
         self._P = P
         self._stands = np.ones(N, bool)
+        self._speed = sample.v.copy()
         self.contact[self.robot.feet] = 1.0
         for c in range(N):
             self._touch_down(c)
@@ -153,6 +159,9 @@ class Estimator:
         for c in np.flatnonzero(stands & ~self._stands):
             self._touch_down(int(c))
         self._stands = stands
+        self._speed += dt / SLOW * (sample.v - self._speed)
+        if stands.all() and np.abs(self._speed).max() < STILL:
+            inekf.correct_gyro_bias(*self._state, sample.gyro, tuning.rest)
         self._last = sample
 
     def state(self, t: float) -> tuple[Array, Array]:

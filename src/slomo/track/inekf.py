@@ -213,3 +213,15 @@ def correct_height(R, v, p, d, bias, P, c, height, sigma):
     H[0], H[1], H[9 + 3 * c + 2] = d[c, 1], -d[c, 0], 1.0
     _take(P, xi, H, d[c, 2] - height, sigma * sigma)
     _remove(R, v, p, d, bias, xi)
+
+
+@compiled
+def correct_gyro_bias(R, v, p, d, bias, P, gyro, sigma):
+    """The root does not turn: gyro (3,) rad/s is bias and noise of sigma."""
+    n = P.shape[0]
+    xi = np.zeros(n)
+    for i in range(3):
+        H = np.zeros(n)
+        H[n - 6 + i] = 1.0
+        _take(P, xi, H, bias[i] - gyro[i], sigma * sigma)
+    _remove(R, v, p, d, bias, xi)

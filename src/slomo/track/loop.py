@@ -29,9 +29,16 @@ LOWEST = 0.5  # of the height that the body should have
 
 @dataclass(frozen=True)
 class Outcome:
-    """rollout; `fall`: None or what happened; `torque_ratio`: (T,) largest |torque asked for| / limit at each tick."""
+    """How it went.
+
+    Attributes:
+        rollout, reference: what happened, and what was to happen, with the lead-in.
+        fall: None or what happened.
+        torque_ratio: (T,) largest |torque asked for| / limit at each tick.
+    """
 
     rollout: Rollout
+    reference: Reference
     fall: str | None
     torque_ratio: Array
     compile_seconds: float = 0.0
@@ -110,7 +117,7 @@ def simulate(
         simulation.step(tau)
         if k % 50 == 0:
             progress.update((t - t0) / (t1 - t0), f"{t:.1f} of {t1:.1f} s")
-    return Outcome(recording.rollout(reference_digest), fall, recording.torque_ratio, compiling)
+    return Outcome(recording.rollout(reference_digest), reference, fall, recording.torque_ratio, compiling)
 
 
 def _stand(simulation: Simulation, reference: Reference, terrain: Terrain, ground: Terrain) -> Array:
