@@ -2,9 +2,9 @@
 
     python tests/bench_mpc.py [--horizons 3,10,20] [--ticks 200] [--minutes 0] [--json]
 
-A trot of 2.5 strides a second with noise on the measured state, one core, compiled code warm. Times are of this thread's
-processor: others at work on the machine do not count, nor does what the operating system takes. Every row is solved at
-the same ticks, about the same plan:
+A trot of 2.5 strides a second with noise on the measured state, one core, compiled code warm. Times are of this
+thread's processor: others at work on the machine do not count. Every row is solved at the same ticks, about the same
+plan:
 
     ncp, lcp     the controller as it runs, whole tick (reference sampled, 2 iterations at most)
     clarabel,    one QP of the same size and structure: the tick's linearised dynamics as equations, its weights, limits
