@@ -122,7 +122,7 @@ def test_slippery_ground_shows():
         ({"mpc_hz": 333}, "track.mpc_hz"),
         ({"kp": 0.0}, "track.kp"),
         ({"settle": -1.0}, "track.settle"),
-        ({"horizon": 0}, "track.horizon"),
+        ({"horizon": -1}, "track.horizon"),
     ],
 )
 def test_parameters_out_of_range(config, where):
