@@ -237,8 +237,9 @@ def person(path, roll, *, raised=0.0):
     open_ = 0.3 + 0.25 * np.sin(2 * t)
     ends = np.zeros((60, 4, 3))
     for i, (side, up, length) in enumerate([(1, 1, 0.7), (-1, 1, 0.7), (1, -1, 0.9), (-1, -1, 0.9)]):
-        angle = open_ if not raised else 0.3 + (raised * (1 + np.sin(2 * t)) if i == 2 else 0 * t)
-        angle = np.pi - 2.4 * angle if up > 0 and not raised else angle
+        angle = np.pi - 2.4 * open_ if up > 0 else open_
+        if raised and up < 0:
+            angle = 0.3 + (raised * (1 + np.sin(2 * t)) if i == 2 else 0 * t)
         ends[:, i, 1], ends[:, i, 2] = side * length * np.sin(angle), -length * np.cos(angle)
     s, c = np.sin(roll * np.sin(2 * t))[:, None], np.cos(roll * np.sin(2 * t))[:, None]
     ends[..., 1], ends[..., 2] = c * ends[..., 1] - s * ends[..., 2], s * ends[..., 1] + c * ends[..., 2]
