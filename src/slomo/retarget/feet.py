@@ -107,7 +107,7 @@ def slow_motion(standing: np.ndarray, *, dt: float) -> float:
     Args:
         standing: (T, F) bool.
     """
-    flights = [b - a for a, b in runs(~standing.any(axis=1)) if a > 0 and b < len(standing)]
+    flights = [b - a for a, b in runs(np.logical_not(standing.any(axis=1))) if a > 0 and b < len(standing)]
     usual = dt * float(np.median(flights)) if len(flights) > 1 else 0.0
     return usual / _JUMP if usual > 2 * _JUMP else 1.0
 
