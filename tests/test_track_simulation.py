@@ -8,8 +8,8 @@ import pytest
 from slomo.robot import load_robot
 from slomo.terrain import Box, Terrain
 from slomo.track.joint_space import JointSpace
-from slomo.track.mpc import PlanPoint
-from slomo.track.simulation import ARMATURE, Simulation
+from slomo.track.plan import PlanPoint
+from slomo.track.simulation import Simulation
 
 NAMES = ("go1", "a1", "go2")
 
@@ -58,7 +58,7 @@ def test_mujoco_agrees_with_pinocchio(name):
         mujoco.mj_fullM(sim.model, sim.data, M)
         want = np.array(pin.crba(robot.model, data, q))
         want = np.triu(want) + np.triu(want, 1).T
-        want[range(6, robot.model.nv), range(6, robot.model.nv)] += ARMATURE
+        want[range(6, robot.model.nv), range(6, robot.model.nv)] += robot.rotor_inertia
         np.testing.assert_allclose(T.T @ M @ T, want, atol=2e-6)
 
 
@@ -147,7 +147,7 @@ def test_state_and_pose_are_inverse_and_velocities_are_derivatives():
     ahead, _ = joints.state(pin.integrate(robot.model, q, v * dt), v)
     np.testing.assert_allclose((ahead[:3] - q_point[:3]) / dt, v_point[:3], atol=1e-4)
     np.testing.assert_allclose((ahead[7:] - q_point[7:]) / dt, v_point[6:], atol=1e-4)
-    command = joints.command(plan_point(q_point, v_point), u=np.zeros((4, 3)), q=q)
+    command = joints.command(point := plan_point(q_point, v_point), point, u=np.zeros((4, 3)), q=q, v=v)
     np.testing.assert_allclose(command.v, v[6:], atol=1e-2)
 
 
@@ -159,7 +159,8 @@ def test_forces_of_the_legs_are_those_of_statics():
     q[3:7] = pin.Quaternion(pin.rpy.rpyToMatrix(0.2, -0.3, 1.0)).coeffs()
     u = np.tile([5.0, -3.0, 30.0], (4, 1))
     q_point, v_point = joints.state(q, np.zeros(18))
-    tau = joints.command(plan_point(q_point, v_point), u=u, q=q).tau
+    point = plan_point(q_point, v_point)
+    tau = joints.command(point, point, u=u, q=q, v=v_point).tau
     for j in range(12):
         v = np.zeros(18)
         v[6 + j] = 1.0

@@ -1,4 +1,4 @@
-"""The commands that make artifacts."""
+"""The commands that make artifacts, from the clip to the reference, the report, and all at once."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -237,23 +237,6 @@ def add_commands(app: typer.Typer) -> None:
             changes |= {"shortest_step": 0.7 if free_steps else None, "longest_step": 1.4 if free_steps else None}
         project = session.configure({"optimize": changes}, robot)
         session.emit_artifact(session.runner(project).make_only("optimize"))
-
-    @command(app, "track", runs=True)
-    def track(
-        session: Session,
-        robot: RobotOption,
-        sim: Annotated[bool, typer.Option("--sim", help="In simulation (MuJoCo).")] = False,
-        no_video: Annotated[bool, typer.Option("--no-video", help="Leave out the report with its video.")] = False,
-    ) -> None:
-        """The robot follows the reference; then the report with the side-by-side video.
-
-        \b
-        slomo track --sim --robot go1
-        """
-        if not sim:
-            raise UsageError("where is the robot?", where="track", valid=("--sim",))
-        runner = session.runner(session.project(robot))
-        session.emit_artifact(runner.make_only("track", show=not no_video))
 
     @command(app, "report", runs=True)
     def report(session: Session, robot: RobotOption, truth: TruthOption = None) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
 from slomo.robot import Robot
-from slomo.track.mpc import PlanPoint
+from slomo.track.plan import PlanPoint
 
 Array = np.ndarray
 
@@ -28,21 +28,29 @@ class JointCommand:
 
     Attributes:
         q: (nj,) rad.  v: (nj,) rad/s.  tau: (nj,) N m, feed-forward.
+        kp: (nj,) N m/rad.  kd: (nj,) N m s/rad.
     """
 
     q: Array
     v: Array
     tau: Array
+    kp: Array
+    kd: Array
 
 
 class JointSpace:
     """Inverse kinematics of all feet at once, and J^T forces.
 
     Deterministic: it starts from its last solution (the nominal pose after `reset`).
+
+    Args:
+        kp: N m/rad, kd: N m s/rad, of the motors' PD: one number for all or (nj,).
     """
 
-    def __init__(self, robot: Robot):
+    def __init__(self, robot: Robot, *, kp: Array | float = 20.0, kd: Array | float = 1.0):
         self.robot, self.model, self.data = robot, robot.model, robot.model.createData()
+        nj = len(robot.joint_names)
+        self.kp, self.kd = np.broadcast_to(kp, nj), np.broadcast_to(kd, nj)
         self._base = self.model.getFrameId(robot.base)
         self._feet = [self.model.getFrameId(name) for name in robot.foot_names]
         self._hips = [self.model.getFrameId(limb.hip) for limb in robot.limbs]
@@ -102,21 +110,21 @@ class JointSpace:
         speeds = [pin.getFrameVelocity(self.model, self.data, f, world).linear for f in self._feet]
         return np.concatenate([base, *points]), np.concatenate([twist.linear, omega, *speeds])
 
-    def command(self, target: PlanPoint, *, u: Array, q: Array) -> JointCommand:
+    def command(self, now: PlanPoint, ahead: PlanPoint, *, u: Array, q: Array, v: Array) -> JointCommand:
         """Joint targets of a point-foot state and the torques of leg forces.
 
         tau = -J^T R^T u: the legs press the feet down with -u so that they carry the body with u.
 
         Args:
-            target: where the robot should be.
+            now, ahead: where the robot should be, and where a little later, at which the joints aim.
             u: (C, 3) N, world, forces of the feet on the body.
-            q: (nq,) where the robot is, for the Jacobian of the forces.
+            q: (nq,) where the robot is, for the Jacobian of the forces.  v: (nv,).
         """
-        R = _matrix(target.quat_xyzw)
-        feet = (target.points - target.position) @ R
+        R = _matrix(ahead.quat_xyzw)
+        feet = (ahead.points - ahead.position) @ R
         joints = self.solve(feet)
         _, J = self._feet_in_root(joints)
-        relative = (target.point_velocities - target.velocity) @ R - np.cross(target.angular_velocity, feet)
+        relative = (ahead.point_velocities - ahead.velocity) @ R - feet @ pin.skew(ahead.angular_velocity).T
         speeds = _damped_solve(J, (relative @ self._T_root_base.rotation.T).ravel())
         _, J_now = self._feet_in_root(q[7:])
         R_root = _matrix(q[3:7])
@@ -125,6 +133,8 @@ class JointSpace:
             joints,
             np.clip(speeds, -self.robot.velocity, self.robot.velocity),
             np.clip(tau, -self.robot.effort, self.robot.effort),
+            self.kp,
+            self.kd,
         )
 
     def _feet_in_root(self, joints: Array) -> tuple[Array, Array]:

@@ -9,20 +9,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slomo.errors import UsageError
 from slomo.motion import Reference
-from slomo.optimize import constraints, ddp, so3
+from slomo.optimize import constraints, ddp
 from slomo.optimize.cost import Task
-from slomo.optimize.dynamics import Body, minus
+from slomo.optimize.dynamics import Body
 from slomo.optimize.iterate import Iterate, Work
-from slomo.optimize.jit import compiled
+from slomo.optimize.linear_body import NONLINEAR, LinearBody, linearize_reference
 from slomo.pointfoot import PointFootModel
 from slomo.terrain import Terrain
+from slomo.track.plan import Plan, sample_all
 
 Array = np.ndarray
 
 _REG = 1e-6  # first Levenberg-Marquardt factor of every tick: one grown in an earlier tick would freeze the plan
 _DEFECT = 1.0  # l1 norm of the gaps under which an iterate that finds no further descent is a plan
 _PENALTY = 1e4  # 1/m^2
+MODELS = ("ncp", "lcp")
 
 
 @dataclass(frozen=True)
@@ -30,136 +33,36 @@ class MpcConfig:
     """Parameters of the controller; weights as in `optimize.problem.Weights`.
 
     Attributes:
+        mpc_model: what it plans with. "ncp": the nonlinear dynamics (a nonlinear complementarity problem). "lcp": the
+            body linearised about the reference, only contact left as it is (see `optimize.linear_body`).
         horizon: number of steps.  dt: s, their length.
         iterations: most Newton steps a tick.  tolerance: relative decrease of the cost that ends them.
         mu: friction coefficient to plan with.  kappa: N m, smoothing of the contact.
-        effort: 1/N^2, weight of the deviation from the reference's forces.
+        effort: of the deviation from the reference's forces, as shares of the robot's weight.
         terminal: s, weight of the end state (as if it lasted that long).
+        stride: how far, as a share of the body's height, its capture point may be off before the feet go there.
     """
 
+    mpc_model: str = "ncp"
     horizon: int = 10
     dt: float = 0.025
-    iterations: int = 4
+    iterations: int = 2
     tolerance: float = 1e-6
     mu: float = 0.6
     kappa: float = 1e-3
     position: float = 1000.0
     orientation: float = 300.0
-    foot: float = 300.0
+    foot: float = 1000.0
     foot_height: float = 500.0
     velocity: float = 10.0
     angular_velocity: float = 2.0
     foot_velocity: float = 0.5
-    effort: float = 2e-4
+    effort: float = 3.3
     acceleration: float = 0.0
     slip: float = 300.0
-    slip_load: float = 2.0
+    slip_load: float = 0.0156
     terminal: float = 0.1
-
-
-@compiled
-def _sample(knots, qs, vs, us, t, q, v, u):
-    """State at time t between knots (N + 1,), by linear interpolation (rotations along the geodesic), and the velocity
-    and input of the step that t is in, as the integrator has them. Outside of the knots it stands still."""
-    N = us.shape[0]
-    k = 0
-    while k < N and t >= knots[k + 1] - 1e-9:
-        k += 1
-    moving = 1.0 if k < N and t >= knots[0] - 1e-9 else 0.0
-    n = min(k + 1, N)
-    a = moving * max(t - knots[k], 0.0) / (knots[n] - knots[k]) if n > k else 0.0
-    w = np.empty(3)
-    so3.minus(qs[n, 3:7], qs[k, 3:7], w)
-    so3.plus(qs[k, 3:7], a * w[0], a * w[1], a * w[2], q[3:7])
-    for i in range(qs.shape[1]):
-        if i < 3 or i >= 7:
-            q[i] = (1 - a) * qs[k, i] + a * qs[n, i]
-    for i in range(v.shape[0]):
-        v[i] = moving * vs[n, i]
-    for i in range(u.shape[0]):
-        u[i] = us[min(k, N - 1), i]
-
-
-@compiled
-def _sample_all(knots, qs, vs, us, t, q_out, v_out, u_out):
-    """`_sample` at times t (M + 1,): states at them, velocities and inputs in the middle of the step before."""
-    u, v = np.empty(us.shape[1]), np.empty(vs.shape[1])
-    for k in range(t.shape[0]):
-        before = 0.5 * (t[k] + t[k - 1]) if k > 0 else t[0] - 0.5 * (t[1] - t[0])
-        _sample(knots, qs, vs, us, before, q_out[k], v_out[k], u_out[k - 1] if k > 0 else u)
-        _sample(knots, qs, vs, us, t[k], q_out[k], v, u)
-
-
-@dataclass(frozen=True)
-class PlanPoint:
-    """The plan at one time, world frame.
-
-    Attributes:
-        position: (3,) m.  quat_xyzw: (4,).  velocity: (3,) m/s.  angular_velocity: (3,) rad/s, body frame.
-        points, point_velocities: (C, 3) m, m/s.  u: (C, 3) N, of each point on the body.  lam: (C, 3) N, of the ground.
-    """
-
-    position: Array
-    quat_xyzw: Array
-    velocity: Array
-    angular_velocity: Array
-    points: Array
-    point_velocities: Array
-    u: Array
-    lam: Array
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What the controller intends from time `t` on.
-
-    Attributes:
-        t: (H + 1,) s, its knots; the first is when the state was measured.
-        q (H + 1, 7 + 3 C), v (H + 1, 6 + 3 C), u (H, 3 C), lam (H, C, 3): as in `motion.Reference`.
-        gains: (H, 3 C, 12 + 6 C), Riccati feedback of u on the tangent-space deviation from q, v.
-        status: 0 solved, 1 the solver failed and the previous plan goes on.
-        defect: l1 norm of what the dynamics lack over the horizon.
-        seconds: wall time of the solve.
-    """
-
-    t: Array
-    q: Array
-    v: Array
-    u: Array
-    lam: Array
-    gains: Array
-    u_max: Array
-    status: int
-    defect: float
-    seconds: float
-
-    def at(self, t: float) -> PlanPoint:
-        """The plan at time t (s), between its knots; before or after them it stands still."""
-        q, v, u = np.empty(self.q.shape[1]), np.empty(self.v.shape[1]), np.empty(self.u.shape[1])
-        _sample(self.t, self.q, self.v, self.u, t, q, v, u)
-        return PlanPoint(
-            position=q[:3],
-            quat_xyzw=q[3:7],
-            velocity=v[:3],
-            angular_velocity=v[3:6],
-            points=q[7:].reshape(-1, 3),
-            point_velocities=v[6:].reshape(-1, 3),
-            u=u.reshape(-1, 3),
-            lam=self.lam[self._step(t)],
-        )
-
-    def feedback(self, t: float, q: Array, v: Array) -> Array:
-        """(C, 3) N: the forces for the state that is there at time t, by the Riccati gains, within the limits."""
-        qp, vp, u = np.empty(self.q.shape[1]), np.empty(self.v.shape[1]), np.empty(self.u.shape[1])
-        _sample(self.t, self.q, self.v, self.u, t, qp, vp, u)
-        k = self._step(t)
-        a = min(max((t - self.t[k]) / (self.t[k + 1] - self.t[k]), 0.0), 1.0)
-        d = np.empty(2 * len(v))
-        minus(q, v, qp, (1 - a) * self.v[k] + a * self.v[k + 1], d)
-        return np.clip(u + self.gains[k] @ d, -self.u_max, self.u_max).reshape(-1, 3)
-
-    def _step(self, t: float) -> int:
-        return min(max(int(np.searchsorted(self.t, t + 1e-9)) - 1, 0), len(self.u) - 1)
+    stride: float = 0.1
 
 
 class Mpc:
@@ -175,6 +78,8 @@ class Mpc:
         self, model: PointFootModel, reference: Reference, *, terrain: Terrain, config: MpcConfig | None = None
     ):
         self.config = c = config or MpcConfig()
+        if c.mpc_model not in MODELS:
+            raise UsageError(f"no model {c.mpc_model!r}", where="track.mpc_model", valid=MODELS)
         self.model = replace(model, mu=c.mu)
         self.terrain = terrain
         self.reference = reference
@@ -186,20 +91,23 @@ class Mpc:
         w[:, 6:nv] = np.tile([c.foot, c.foot, c.foot_height], C)
         w[:, nv : nv + 3], w[:, nv + 3 : nv + 6], w[:, nv + 6 :] = c.velocity, c.angular_velocity, c.foot_velocity
         h = np.append(np.full(H, c.dt), c.terminal)
+        weight = model.total_mass * model.g
         self._task = Task(
             h=h, ground=np.tile([0.0, 0.0, 1.0, 0.0], (H + 1, C, 1)), stick=np.zeros((H, C), bool),
             q_ref=np.zeros((H + 1, nv + 1)), v_ref=np.zeros((H + 1, nv)),
-            u_ref=np.zeros((H, 3 * C)), w_x=w, w_u=np.full((H, 3 * C), c.effort),
+            u_ref=np.zeros((H, 3 * C)), w_x=w, w_u=np.full((H, 3 * C), c.effort / weight**2),
             u_low=np.tile(-model.u_max.ravel(), (H, 1)), u_high=np.tile(model.u_max.ravel(), (H, 1)),
-            w_acceleration=c.acceleration, w_spin=0.0, w_slip=c.slip, slip_load=c.slip_load, cyclic=False,
-            shift=np.zeros(4),
+            w_acceleration=c.acceleration, w_spin=0.0, w_slip=c.slip, slip_load=c.slip_load * weight, cyclic=False,
+            shift=np.zeros(4), linear=NONLINEAR if c.mpc_model == "ncp" else LinearBody.zeros(H, C),
         )  # fmt: skip
+        self._feet = np.flatnonzero(np.isfinite(model.clearance))  # not the hands
         self._work = Work.make(self._new_iterate())
         r = reference
         self._t_ref, self._q_ref, self._v_ref, self._u_ref = (
             np.ascontiguousarray(x, float) for x in (r.t, r.q, r.v, r.u)
         )
         self._hold = self._standing_forces()
+        self._along = self._linearized() if c.mpc_model == "lcp" else NONLINEAR
         self._plan: Plan | None = None
 
     def _standing_forces(self) -> Array:
@@ -209,6 +117,46 @@ class Mpc:
         u = np.zeros((self.model.C, 3))
         u[:, 2] = self.model.mass * self.model.g * near / near.sum()
         return u.ravel()
+
+    def _sample_reference(self, knots: Array, q: Array, v: Array, u: Array) -> None:
+        """The reference at knots (M + 1,), as `plan.sample_all` has it; after its end it stands."""
+        sample_all(self._t_ref, self._q_ref, self._v_ref, self._u_ref, knots, q, v, u)
+        u[knots[1:] > self.reference.t[-1] + 1e-9] = self._hold
+
+    def _linearized(self) -> LinearBody:
+        """Matrices along the whole reference in steps of dt, and one step more, in which it stands."""
+        dt, origin = self.config.dt, self.reference.t[0]
+        M = int(np.ceil((self.reference.t[-1] - origin) / dt - 1e-9)) + 1
+        along = LinearBody.zeros(M, self.model.C)
+        self._sample_reference(origin + dt * np.arange(M + 1), along.q, along.v, along.u)
+        linearize_reference(self._body, np.full(M, dt), along, 0, M)
+        return along
+
+    def _linearize(self, first: int) -> None:
+        """The task's matrices, where `first` is its first knot's place in the grid: those made beforehand, and those of
+        the first step, which is shorter."""
+        task, linear, along = self._task, self._task.linear, self._along
+        steps = np.minimum(first + np.arange(len(linear.c)), len(along.c) - 1)
+        for name in ("A", "B", "c"):
+            np.take(getattr(along, name), steps, axis=0, out=getattr(linear, name))
+        linear.q[:], linear.v[:], linear.u[:] = task.q_ref, task.v_ref, task.u_ref
+        linearize_reference(self._body, task.h, linear, 0, 1)
+
+    def _catch(self, q: Array, v: Array) -> None:
+        """Move the feet's wanted places under a body that has been pushed off the reference.
+
+        No step to the side is worth its cost within a short horizon as long as the feet are wanted where they were. So
+        they are wanted where they can stop the body: off by its displacement and sqrt(height / g) times its excess
+        speed (the capture point of Pratt et al. 2006; where Raibert placed feet), less a dead zone, in which small
+        errors leave them in their places. When they go there is still the solver's choice.
+        """
+        task = self._task
+        away, excess = q[:2] - task.q_ref[0, :2], v[:2] - task.v_ref[0, :2]
+        height = max(q[2] - float(task.q_ref[0, 9::3].min()), 0.0)
+        step = away + np.sqrt(height / self.model.g) * excess
+        step *= max(0.0, 1 - self.config.stride * height / max(float(np.linalg.norm(step)), 1e-9))
+        for c in self._feet:
+            task.q_ref[:, 7 + 3 * c : 9 + 3 * c] += step
 
     def _new_iterate(self) -> Iterate:
         task = self._task
@@ -227,11 +175,13 @@ class Mpc:
         self.reset()
         return time.perf_counter() - start
 
-    def step(self, t: float, q: Array, v: Array) -> Plan:
+    def step(self, t: float, q: Array, v: Array, *, shift: Array | float = 0.0) -> Plan:
         """Plan from the measured state.
 
         Args:
             t: s, on the reference's clock.  q: (7 + 3 C,), v: (6 + 3 C,) as in `motion.Reference`.
+            shift: (C,) m, how much higher the ground under each point is found to be than the terrain says; the
+                reference's points go up with it.
         """
         start = time.perf_counter()
         c, task = self.config, self._task
@@ -240,20 +190,27 @@ class Mpc:
         # contact planned at a knot comes nearer, instead of being put off by a little at every tick. The last fifth of
         # a step joins the next one, because the model is stiff in very short steps.
         origin = float(self.reference.t[0])
-        knots = origin + c.dt * (np.floor((t - origin) / c.dt + 0.2) + np.arange(H + 1))
+        first = int(np.floor((t - origin) / c.dt + 0.2))
+        knots = origin + c.dt * (first + np.arange(H + 1))
         knots[0] = t
         task.h[0] = knots[1] - t
-        _sample_all(self._t_ref, self._q_ref, self._v_ref, self._u_ref, knots, task.q_ref, task.v_ref, task.u_ref)
-        task.u_ref[knots[1:] > self.reference.t[-1] + 1e-9] = self._hold
+        self._sample_reference(knots, task.q_ref, task.v_ref, task.u_ref)
+        if c.mpc_model == "lcp":
+            self._linearize(first)
+        task.q_ref[:, 9::3] += shift
+        self._catch(q, v)
         last = self._plan
         it = self._new_iterate()
         if last is not None:
             # The last plan as far as it reaches; what follows stays at the reference.
             n = int(np.searchsorted(knots, last.t[-1] + 1e-9)) - 1
             if n > 0:
-                _sample_all(last.t, last.q, last.v, last.u, knots[: n + 1], it.qs[: n + 1], it.vs[: n + 1], it.us[:n])
+                sample_all(last.t, last.q, last.v, last.u, knots[: n + 1], it.qs[: n + 1], it.vs[: n + 1], it.us[:n])
         it.qs[0], it.vs[0] = q, v
-        task.ground[:] = self.terrain.planes(it.qs[:, 7:].reshape(H + 1, C, 3))
+        # The LCP's gaps are about the reference, as all else in it.
+        under = it.qs if c.mpc_model == "ncp" else task.q_ref
+        task.ground[:] = self.terrain.planes(under[:, 7:].reshape(H + 1, C, 3))
+        task.ground[:, :, 3] += shift * task.ground[:, :, 2]
         status, _, _, defect, _ = ddp.solve(
             self._body, task, c.kappa, it, _PENALTY, False, c.iterations, c.tolerance, 1e-7, _REG, self._work
         )
