@@ -33,9 +33,11 @@ def _entries(module: str, name: str) -> list[tuple[str, Any, str]]:
         raise ModuleNotFoundError(f"no module {module}")
     source = Path(spec.origin).read_text()
     body = ast.parse(source).body
-    record = next(n for n in body if isinstance(n, ast.ClassDef) and n.name == name)
-    named = {base.id for base in record.bases if isinstance(base, ast.Name)}
     froms = {a.name: n.module for n in body if isinstance(n, ast.ImportFrom) for a in n.names}
+    record = next((n for n in body if isinstance(n, ast.ClassDef) and n.name == name), None)
+    if record is None:
+        return _entries(str(froms[name]), name)
+    named = {base.id for base in record.bases if isinstance(base, ast.Name)}
     inherited = [entry for base in named for entry in _entries(froms.get(base) or module, base)]
     fields = {
         n.target.id: n.value

@@ -14,7 +14,7 @@ from slomo.deploy.log import SENT, Log
 from slomo.deploy.postures import Postures, blend
 from slomo.deploy.receiver import Receiver
 from slomo.deploy.sequence import ANSWER, CONTROLLED, ORDER, UPRIGHT, Phase, Sequence
-from slomo.deploy.supervisor import Cause, Supervisor, Trip
+from slomo.deploy.supervisor import CAUSES, Cause, Supervisor, Trip
 from slomo.robot import Robot
 from slomo.track.joint_space import JointCommand
 
@@ -22,7 +22,6 @@ Array = np.ndarray
 
 PERIOD = 1 / HZ
 ANSWER_BY = 0.8  # of a period: when a command must be there to be sent in it
-CAUSES = tuple(Cause)
 
 
 @dataclass(frozen=True)
@@ -67,6 +66,7 @@ class Drive:
         self._samples: list[RobotState] = []
         self._truth = np.full(7, np.nan)
         self._reply: Reply | None = None
+        self._held = False
         self._shift = 0.0  # s, from the driver's clock to the motion's
         self._begin = self._next = clock.now()
         self._ticks = self._missed = 0
@@ -169,6 +169,7 @@ class Drive:
         self._samples.clear()
         self.brain.ask(now + self._shift, samples)
         reply = self.brain.answer(max(0.0, self._next + ANSWER_BY * PERIOD - self.clock.now()))
+        self._held = reply is None
         if reply is None:
             return None
         self._reply = reply
@@ -177,6 +178,7 @@ class Drive:
 
     def _let_down(self) -> None:
         """Damping for a while, then the motors off; nothing here may fail."""
+        self.supervisor.rest()
         damping, off = self._go1.damping_datagram(), self._go1.off_datagram()
         self.sequence.enter(Phase.DAMP, self.clock.now(), self.sequence.joints)
         while not self.sequence.over(self.clock.now()):
@@ -194,7 +196,7 @@ class Drive:
         r["t"], r["late"] = now - self._begin, now - self._next
         r["phase"], r["sent"] = ORDER.index(self.sequence.phase), SENT.index(sent)
         trip = self.supervisor.trip
-        r["trip"] = 1 + CAUSES.index(trip.cause) if trip else 0
+        r["trip"], r["why"] = (1 + CAUSES.index(trip.cause), str(trip).encode()[:120]) if trip else (0, b"")
         r["reference_t"] = now + self._shift if self.sequence.phase in CONTROLLED else np.nan
         if state:
             s = state.sample
@@ -209,6 +211,7 @@ class Drive:
         if reply:
             r["q_est"], r["v_est"] = reply.q, reply.v
             r["mpc_t"], r["mpc_ms"], r["mpc_status"] = reply.mpc_t, reply.mpc_ms, reply.mpc_status
+        r["held"] = self._held and self.sequence.phase in CONTROLLED
         counts = self._receiver.counts
         r["accepted"], r["rejected"] = counts["accepted"], counts.total() - counts["accepted"]
         self.log.append()

@@ -6,6 +6,7 @@ n % capacity. Each record has a check sum of its own, so that one that was being
 
 import json
 import mmap
+import os
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -31,7 +32,8 @@ RECORD = np.dtype(
         ("t", "<f8"),  # s since the run began
         ("late", "<f4"),  # s, how late the tick began
         ("phase", "u1"),  # index into sequence.ORDER
-        ("trip", "u1"),  # 0, or 1 + index into the list of causes
+        ("trip", "u1"),  # 0, or 1 + index into supervisor.CAUSES
+        ("why", "S120"),  # the trip in words, UTF-8
         ("reference_t", "<f8"),  # s on the motion's clock, nan before it
         # The newest state: when it was measured (s since the run began), and what it says.
         ("state_t", "<f8"),
@@ -59,6 +61,7 @@ RECORD = np.dtype(
         ("mpc_t", "<f8"),
         ("mpc_ms", "<f4"),
         ("mpc_status", "i1"),
+        ("held", "u1"),  # 1: the controller had no new command
         ("accepted", "<u4"),  # datagrams so far
         ("rejected", "<u4"),
     ]
@@ -99,9 +102,10 @@ class Log:
         self._map[at : at + RECORD.itemsize] = check + data[_CHECKED:]
 
     def close(self) -> None:
-        """To the disk."""
+        """To the disk, without the part of the ring that was never reached."""
         self._map.flush()
         self._map.close()
+        os.truncate(self.path, HEADER + min(self._number, self.capacity) * RECORD.itemsize)
 
 
 def read(path: Path) -> tuple[dict[str, Any], Array]:

@@ -52,6 +52,9 @@ class Cause(StrEnum):
     SIGNAL = "stopped by a signal"
 
 
+CAUSES = tuple(Cause)
+
+
 @dataclass(frozen=True)
 class Trip:
     """cause; t: s, when; detail: what was measured."""
@@ -80,7 +83,7 @@ class Supervisor:
         self.robot, self.config = robot, config
         self.trip: Trip | None = None
         self.landing: Trip | None = None
-        self.upright = False
+        self.upright = self._resting = False
         self.state: RobotState | None = None
         self._heard: float | None = None
         self._begun: float | None = None
@@ -98,8 +101,12 @@ class Supervisor:
 
     def stop(self, cause: Cause, now: float, detail: str) -> None:
         """Trip. The first one stays."""
-        if self.trip is None:
+        if self.trip is None and not self._resting:
             self.trip = Trip(cause, now, detail)
+
+    def rest(self) -> None:
+        """The run is over and the robot goes down: what is seen from now on is no reason to stop it."""
+        self._resting = True
 
     def see(self, state: RobotState, arrival: float) -> None:
         """A state that is newer than the last, and when it came in (s)."""
