@@ -55,7 +55,7 @@ def test_sways_without_falling(name):
     assert m["foot_rmse"] < 0.02
     assert m["orientation_rmse"] < 3
     assert m["torque_ratio_p99"] < 1
-    assert m["state"] == "truth"
+    assert m["state"] == "estimated"
     assert 0 < m["mpc_ms_p50"] <= m["mpc_ms_p99"]
     assert m["missed_ticks"] >= 0
 

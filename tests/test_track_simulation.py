@@ -9,7 +9,7 @@ from slomo.robot import load_robot
 from slomo.terrain import Box, Terrain
 from slomo.track.joint_space import JointSpace
 from slomo.track.mpc import PlanPoint
-from slomo.track.simulation import ARMATURE, Simulation
+from slomo.track.simulation import Simulation
 
 NAMES = ("go1", "a1", "go2")
 
@@ -58,7 +58,7 @@ def test_mujoco_agrees_with_pinocchio(name):
         mujoco.mj_fullM(sim.model, sim.data, M)
         want = np.array(pin.crba(robot.model, data, q))
         want = np.triu(want) + np.triu(want, 1).T
-        want[range(6, robot.model.nv), range(6, robot.model.nv)] += ARMATURE
+        want[range(6, robot.model.nv), range(6, robot.model.nv)] += robot.rotor_inertia
         np.testing.assert_allclose(T.T @ M @ T, want, atol=2e-6)
 
 

@@ -179,6 +179,7 @@ class Rollout(_Arrays):
         body_ref, points_ref: the reference at the same times, shapes as above.
         mpc_t: (K,) s.  mpc_ms: (K,) wall time of each solve.  mpc_status: (K,) 0 = solved, 1 = previous plan kept.
         point_names, joint_names: names.  reference_digest: what was tracked.
+        body_est: (T, 7) base pose as the controller had it.  contact_est: (T, C) probability of contact, likewise.
     """
 
     t: Array
@@ -197,6 +198,8 @@ class Rollout(_Arrays):
     point_names: tuple[str, ...]
     joint_names: tuple[str, ...]
     reference_digest: str = field(default="")
+    body_est: Array = field(default_factory=lambda: np.zeros((0, 7)))
+    contact_est: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 @dataclass(frozen=True)

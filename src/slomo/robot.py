@@ -21,6 +21,7 @@ from slomo.robot_model import (
     add_frame,
     build_model,
     joint_limit,
+    joint_values,
     make_limb,
     nominal_pose,
     position_limits,
@@ -31,6 +32,11 @@ from slomo.robot_workspace import workspace
 Array = np.ndarray
 
 BASE_FRAME = "point_foot_body"
+# kg m2, rotor inertia seen at a joint of which nothing is known: a small quadruped's (0.0045 to 0.010 on the Go1).
+ROTOR_INERTIA = 0.01
+# Of the highest speed, the one up to which a motor gives all of its torque, where nothing is known: that of the Go2's
+# hips in their maker's torque-speed curve (13.5 of 30 rad/s).
+KNEE = 0.45
 # Part of every robot's digest: raised when the same files come to mean another robot.
 _MEANING = b"2: the base is the centre of mass of the point-foot model's body"
 
@@ -50,6 +56,8 @@ class Robot:
         limbs: C limbs.
         q_nominal: (nq,) standing pose, feet on the ground z = 0, joints in the model's order.
         lower, upper: (nj,) rad.  effort: (nj,) N m.  velocity: (nj,) rad/s.
+        rotor_inertia: (nj,) kg m2, as seen at the joint.  knee_speed: (nj,) rad/s, up to which a motor gives its full
+            effort; from there it falls to nothing at `velocity`.
         locked: patterns of joints of the URDF that the model lacks, at zero.
         digest: SHA-256 of the file and the URDF.
         notes: what was repaired, for the user's eyes.
@@ -70,6 +78,8 @@ class Robot:
     upper: Array
     effort: Array
     velocity: Array
+    rotor_inertia: Array
+    knee_speed: Array
     digest: str
     locked: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
@@ -271,6 +281,9 @@ def load_robot(name_or_path: str) -> Robot:
     lower, upper = position_limits(file, model, path)
     effort = joint_limit("effort", file.effort, model.effortLimit[6:], model, path)
     velocity = joint_limit("velocity", file.velocity, model.velocityLimit[6:], model, path)
+    rotors = np.full(len(effort), ROTOR_INERTIA)
+    rotor_inertia = joint_values("rotor_inertia", file.rotor_inertia, rotors, model, path)
+    knee_speed = np.minimum(joint_values("knee_speed", file.knee_speed, KNEE * velocity, model, path), velocity)
     note = repair_base_inertia(model)
     limbs = tuple(make_limb(section, model, urdf, path) for section in file.limbs)
     q_nominal = nominal_pose(file, model, limbs, path)
@@ -301,6 +314,8 @@ def load_robot(name_or_path: str) -> Robot:
         upper=upper,
         effort=effort,
         velocity=velocity,
+        rotor_inertia=rotor_inertia,
+        knee_speed=knee_speed,
         digest=hashlib.sha256(_MEANING + path.read_bytes() + urdf.read_bytes()).hexdigest(),
         locked=tuple(file.locked),
         notes=(note,) if note else (),

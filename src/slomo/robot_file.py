@@ -52,7 +52,9 @@ class PointFootSection(_Strict):
 class RobotFile(_Strict):
     """The whole file. Keys of joint tables and entries of `locked` are joint names, `*` matches any part of one.
 
-    `locked` joints stay at zero. `limits`, `effort` (N m) and `velocity` (rad/s) tighten what the URDF says.
+    `locked` joints stay at zero. `limits`, `effort` (N m) and `velocity` (rad/s) tighten what the URDF says. For the
+    motors' model: `rotor_inertia` (kg m2, as seen at the joint), `knee_speed` (rad/s, up to which all of the effort is
+    there).
     """
 
     name: str
@@ -64,6 +66,8 @@ class RobotFile(_Strict):
     limits: dict[str, tuple[float, float]] = {}
     effort: dict[str, float] = {}
     velocity: dict[str, float] = {}
+    rotor_inertia: dict[str, float] = {}
+    knee_speed: dict[str, float] = {}
     locked: list[str] = []
     point_foot: PointFootSection = PointFootSection()
 

@@ -123,6 +123,16 @@ def joint_limit(what: str, patterns: Mapping[str, float], urdf_limit: Array, mod
     return limit
 
 
+def joint_values(what: str, patterns: Mapping[str, float], default: Array, model: pin.Model, path: Path) -> Array:
+    """(nj,) the file's value where it has one, else the default (nj,). Raises `InvalidData` for a negative one."""
+    names, out = list(model.names[2:]), np.array(default, float)
+    for i, value in match_joints(patterns, names, what, path).items():
+        if not 0 <= value < np.inf:
+            raise InvalidData(f"{what}: joint {names[i]} has {value:g}, which is below 0", where=path)
+        out[i] = value
+    return out
+
+
 def nominal_pose(file: RobotFile, model: pin.Model, limbs: Iterable[Limb], path: Path) -> Array:
     """(nq,) the nominal joints, the base link level and as high as puts the lowest foot on the ground."""
     q, names = pin.neutral(model), list(model.names[2:])

@@ -19,7 +19,8 @@ def _cache_folder() -> str:
     """The user's cache folder for these sources; "" (beside the sources) where there is no home."""
     digest = hashlib.sha256()
     here = Path(__file__).parent
-    for path in (*sorted(here.glob("*.py")), here.parent / "track" / "mpc.py"):
+    track = here.parent / "track"
+    for path in (*sorted(here.glob("*.py")), track / "mpc.py", track / "inekf.py"):
         digest.update(path.read_bytes())
     try:
         base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")

@@ -21,17 +21,19 @@ class Config(MpcConfig):
         kd: N m s/rad, its damping.
         lookahead: s, how far ahead of now the joints aim on the plan.
         friction: of the simulated ground; the controller plans with its own `mu`.
+        command_delay: s, from a command to the motors.
         settle: s, standing still in the first pose.
         blend: s, gathering the first pose's velocity.
     """
 
-    state: str = "truth"
+    state: str = "estimated"
     joint_layer: str = "ik"
     mpc_hz: int = 100
     kp: float = 20.0
     kd: float = 1.0
     lookahead: float = 0.02
     friction: float = 0.8
+    command_delay: float = 0.002
     settle: float = 0.3
     blend: float = 0.6
 
@@ -46,6 +48,6 @@ def check(config: Config) -> None:
     for name in ("horizon", "dt", "iterations", "mu", "kappa", "kp", "friction", "blend"):
         if not getattr(config, name) > 0:
             raise UsageError(f"needs a number above 0, got {getattr(config, name)}", where=f"track.{name}")
-    for name in ("kd", "lookahead", "settle"):
+    for name in ("kd", "lookahead", "command_delay", "settle"):
         if not getattr(config, name) >= 0:
             raise UsageError(f"needs a number of at least 0, got {getattr(config, name)}", where=f"track.{name}")

@@ -9,12 +9,15 @@ from slomo.pointfoot import PointFootModel
 from slomo.robot import Robot
 from slomo.terrain import Terrain
 from slomo.track.config import Config
+from slomo.track.estimator import Estimator
 from slomo.track.joint_space import JointCommand, JointSpace
 from slomo.track.lead_in import with_lead_in
 from slomo.track.mpc import Mpc, Plan
 from slomo.track.sensors import SensorSample
 
 Array = np.ndarray
+
+STANDING = 3.0  # N, of planned force from which a point is planned to stand
 
 
 class Controller:
@@ -46,8 +49,9 @@ class Controller:
         self.reference = with_lead_in(reference, model, terrain=terrain, settle=config.settle, blend=config.blend)
         self.planner = planner(model, self.reference, terrain=terrain, config=config)
         self.joints = JointSpace(robot, kp=config.kp, kd=config.kd)
+        self.estimator = Estimator(robot, terrain)
         self.plan: Plan | None = None
-        self._begin(self.first_pose, np.zeros(robot.model.nv))
+        self._begin()
 
     @property
     def first_pose(self) -> Array:
@@ -55,27 +59,32 @@ class Controller:
         self.joints.reset()
         return self.joints.pose(self.reference.q[0])
 
-    @property
-    def estimate(self) -> tuple[Array, Array]:
-        """q (nq,) and v (nv,) of the whole robot, Pinocchio's convention (root velocity in the root's frame)."""
-        return self._q, self._v
-
     def warm_up(self) -> float:
         """Compile everything that runs later; returns the seconds."""
-        return self.planner.warm_up()
+        return self.planner.warm_up() + self.estimator.warm_up()
 
     def start(self, sample: SensorSample) -> None:
         """Begin: the robot stands at rest in about `first_pose`."""
-        self._begin(self.first_pose, np.zeros(self.robot.model.nv))
-        self.sense(sample)
+        self._begin()
+        self.estimator.start(sample, self.first_pose)
 
     def sense(self, sample: SensorSample) -> None:
         """Take in what was measured, at any rate up to 1 kHz."""
-        raise NotImplementedError("state estimation")
+        planned = np.ones(len(self.robot.limbs), bool)
+        if self.plan is not None:
+            planned = self.plan.at(sample.t).lam[:, 2] > STANDING
+        self.estimator.sense(sample, planned)
+
+    def estimate(self, t: float) -> tuple[Array, Array]:
+        """q (nq,) and v (nv,) of the whole robot, Pinocchio's convention (root velocity in the root's frame).
+
+        The filter's, or the true ones where they have been given by `observe`.
+        """
+        return self._true or self.estimator.state(t)
 
     def observe(self, q: Array, v: Array) -> None:
-        """Instead of `sense`, for study: the true q (nq,) and v (nv,)."""
-        self._q, self._v = q, v
+        """Instead of `start` and `sense`, for study: the true q (nq,) and v (nv,)."""
+        self._true = q, v
 
     def command(self, t: float) -> JointCommand:
         """What the motors shall do now; plans anew where that is due.
@@ -83,7 +92,7 @@ class Controller:
         Args:
             t: s, on the reference's clock; never less than before.
         """
-        q, v = self.estimate
+        q, v = self.estimate(t)
         self.point_state = q_point, v_point = self.joints.state(q, v)
         if self.plan is None or t >= self._due - 1e-6:
             self.plan = self.planner.step(t, q_point, v_point)
@@ -92,8 +101,7 @@ class Controller:
         u = self.plan.feedback(t, q_point, v_point)
         return self.joints.command(self.plan.at(t), self.plan.at(t + self.config.lookahead), u=u, q=q, v=v)
 
-    def _begin(self, q: Array, v: Array) -> None:
+    def _begin(self) -> None:
         self.plan, self._due = None, float(self.reference.t[0])
         self.planner.reset()
-        self._q, self._v = q, v
-        self.point_state = self.joints.state(q, v)
+        self._true: tuple[Array, Array] | None = None

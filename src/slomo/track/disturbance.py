@@ -1,8 +1,10 @@
 """What the world does to the robot that the plan does not know."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+
+from slomo.terrain import Terrain
 
 Array = np.ndarray
 
@@ -50,3 +52,12 @@ class Disturbance:
     latency: float = 0.0
     step_height: float = 0.0
     seed: int = 0
+
+    def force(self, t: float) -> Array:
+        """(3,) N, world, of all pushes at time t (s)."""
+        return sum((push.force(t) for push in self.pushes), np.zeros(3))
+
+    def ground(self, terrain: Terrain) -> Terrain:
+        """The terrain with its boxes `step_height` higher; one that would vanish is left out."""
+        h = self.step_height
+        return replace(terrain, boxes=tuple(replace(b, height=b.height + h) for b in terrain.boxes if b.height + h > 0))

@@ -44,12 +44,13 @@ class JointSpace:
     Deterministic: it starts from its last solution (the nominal pose after `reset`).
 
     Args:
-        kp: N m/rad, kd: N m s/rad, of every motor's PD.
+        kp: N m/rad, kd: N m s/rad, of the motors' PD: one number for all or (nj,).
     """
 
-    def __init__(self, robot: Robot, *, kp: float = 20.0, kd: float = 1.0):
+    def __init__(self, robot: Robot, *, kp: Array | float = 20.0, kd: Array | float = 1.0):
         self.robot, self.model, self.data = robot, robot.model, robot.model.createData()
-        self.kp, self.kd = np.full(len(robot.joint_names), kp), np.full(len(robot.joint_names), kd)
+        nj = len(robot.joint_names)
+        self.kp, self.kd = np.broadcast_to(kp, nj), np.broadcast_to(kd, nj)
         self._base = self.model.getFrameId(robot.base)
         self._feet = [self.model.getFrameId(name) for name in robot.foot_names]
         self._hips = [self.model.getFrameId(limb.hip) for limb in robot.limbs]

@@ -4,21 +4,25 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from slomo.motion import Reference, Rollout
 from slomo.robot import Robot
 from slomo.stage import Progress
 from slomo.terrain import Terrain
+from slomo.track.actuators import Motors
 from slomo.track.config import JOINT_HZ, Config
 from slomo.track.controller import Controller
 from slomo.track.disturbance import Disturbance
-from slomo.track.mpc import Mpc
+from slomo.track.joint_space import JointSpace
+from slomo.track.mpc import Mpc, PlanPoint
+from slomo.track.recording import Recording, reference_at
+from slomo.track.sensors import SensorSample, SimulatedSensors
 from slomo.track.simulation import Simulation
 
 Array = np.ndarray
 
 MOTOR_HZ = 1000
+STAND = 0.5  # s, before the controller begins
 LARGEST_TILT = 60.0  # degrees
 LOWEST = 0.5  # of the height that the body should have
 
@@ -47,8 +51,9 @@ def simulate(
 ) -> Outcome:
     """Follow the reference in MuJoCo from the lead-in's first time to the end, or until the robot falls.
 
-    The simulation starts at rest in the reference's first pose. Poses and feet in the roll-out are in the reference's
-    world, whose ground is the plane of the feet's centres: `foot_radius` below those of the roll-out's q.
+    The robot stands in the reference's first pose, on the ground as it is, before the controller begins. Poses and feet
+    in the roll-out are in the reference's world, whose ground is the plane of the feet's centres: `foot_radius` below
+    those of the roll-out's q.
 
     Args:
         reference: without a lead-in.
@@ -56,76 +61,92 @@ def simulate(
         planner: see `Controller`.
     """
     controller = Controller(robot, reference, terrain=terrain, config=config, planner=planner)
-    simulation = Simulation(robot, world or terrain, friction=config.friction, timestep=1 / MOTOR_HZ)
+    ground = disturbance.ground(world or terrain)
+    simulation = Simulation(
+        robot,
+        ground,
+        friction=config.friction * disturbance.friction_scale,
+        timestep=1 / MOTOR_HZ,
+        payload=disturbance.payload,
+        mass_scale=disturbance.mass_scale,
+    )
     progress.update(0, "compiling the controller")
     compiling = controller.warm_up()
-    reference = controller.reference
-    simulation.reset(controller.first_pose)
+    reference, estimated = controller.reference, config.state == "estimated"
+    motors = Motors(robot, delay=config.command_delay + disturbance.latency)
+    sensors = SimulatedSensors(len(robot.joint_names), seed=disturbance.seed)
+    encoder = sensors.q_bias if estimated else 0.0
+    tau = _stand(simulation, reference, terrain, ground)
     t0, t1 = float(reference.t[0]), float(reference.t[-1])
-    rows: dict[str, list] = {k: [] for k in ("t", "q", "v", "q_des", "tau", "body", "points", "lam")}
-    solves: dict[str, list] = {k: [] for k in ("mpc_t", "mpc_ms", "mpc_status")}
-    fall, ratios = None, []
+    recording = Recording(robot, reference, ticks=round((t1 - t0) * JOINT_HZ))
+    joints, fall = JointSpace(robot), None
     for k in range(round((t1 - t0) * MOTOR_HZ)):
         t = t0 + k / MOTOR_HZ
         q, v = simulation.q, simulation.v
-        controller.observe(q, v)
+        if not estimated:
+            controller.observe(q, v)
+        else:
+            sample = sensors.read(SensorSample(t, q[7:], v[6:], tau, v[3:6], simulation.acceleration))
+            controller.sense(sample) if k else controller.start(sample)
         tick = k % (MOTOR_HZ // JOINT_HZ) == 0
         if tick:
-            before = controller.plan
             command = controller.command(t)
-            plan = controller.plan
-            if plan is not before and plan is not None:
-                for name, x in zip(solves, (t, 1e3 * plan.seconds, plan.status), strict=True):
-                    solves[name].append(x)
-        asked = command.kp * (command.q - q[7:]) + command.kd * (command.v - v[6:]) + command.tau
-        tau = np.clip(asked, -robot.effort, robot.effort)
+            motors.send(t, command)
+        asked = motors.asked(t, q[7:] + encoder, v[6:])
+        tau = motors.limited(asked, v[6:])
         if tick:
-            q_point, _ = controller.joints.state(q, v)
+            q_point, _ = joints.state(q, v)
             forces, body_down = simulation.contacts()
-            row = (t, q, v, command.q, tau, q_point[:7], q_point[7:].reshape(-1, 3), forces)
-            for name, x in zip(rows, row, strict=True):
-                rows[name].append(x)
-            ratios.append(np.max(np.abs(asked) / robot.effort))
-            fall = _fallen(q_point, _height(reference, terrain, t), terrain, robot.standing_height, body_down)
+            recording.add(
+                controller, t=t, q=q, v=v, q_des=command.q, tau=tau, asked=asked, body=q_point[:7],
+                points=q_point[7:].reshape(-1, 3), lam=forces,
+            )  # fmt: skip
+            wanted = reference_at(reference, np.array([t]))[0]
+            fall = _fallen(q_point, float(wanted[2] - terrain.height(wanted)), ground, robot, body_down)
             if fall:
                 fall = f"{fall} at {t:.2f} s"
                 break
+        simulation.push(disturbance.force(t))
         simulation.step(tau)
         if k % 50 == 0:
             progress.update((t - t0) / (t1 - t0), f"{t:.1f} of {t1:.1f} s")
-    wanted = _at(reference, np.array(rows["t"]))
-    rollout = Rollout(
-        **{name: np.array(x) for name, x in (rows | solves).items()},
-        body_ref=wanted[:, :7],
-        points_ref=wanted[:, 7:].reshape(len(wanted), -1, 3),
-        point_names=robot.foot_names,
-        joint_names=robot.joint_names,
-        reference_digest=reference_digest,
-    )
-    return Outcome(rollout, fall, np.array(ratios), compiling)
+    return Outcome(recording.rollout(reference_digest), fall, recording.torque_ratio, compiling)
 
 
-def _at(reference: Reference, t: Array) -> Array:
-    """(T, 7 + 3 C) configurations at times t (T,): linear between the knots, rotations along arcs, the ends held."""
-    x = np.stack([np.interp(t, reference.t, column) for column in reference.q.T], axis=-1)
-    turns = Slerp(reference.t, Rotation.from_quat(reference.q[:, 3:7]))
-    x[:, 3:7] = turns(np.clip(t, reference.t[0], reference.t[-1])).as_quat()
-    return x
+def _stand(simulation: Simulation, reference: Reference, terrain: Terrain, ground: Terrain) -> Array:
+    """Let the robot stand in the reference's first pose under stiff motors; returns their last torques (nj,) N m.
+
+    Where the ground is not as planned, each foot is as much higher, and the body by their mean.
+    """
+    robot = simulation.robot
+    q = reference.q[0].copy()
+    higher = ground.height(reference.points[0]) - terrain.height(reference.points[0])
+    q[9::3] += higher
+    q[2] += higher[robot.feet].mean()
+    # Four times the effort a radian: a few millimetres of sag in any robot.
+    joints = JointSpace(robot, kp=4 * robot.effort, kd=0.13 * robot.effort)
+    pose = joints.pose(q)
+    zero = np.zeros_like(reference.points[0])
+    point = PlanPoint(q[:3], q[3:7], np.zeros(3), np.zeros(3), q[7:].reshape(-1, 3), zero, zero, zero)
+    command = joints.command(point, point, u=reference.u[0].reshape(-1, 3), q=pose, v=np.zeros(robot.model.nv))
+    motors = Motors(robot)
+    motors.send(0.0, command)
+    simulation.reset(pose)
+    tau = command.tau
+    for _ in range(round(STAND * MOTOR_HZ)):
+        v = simulation.v[6:]
+        tau = motors.limited(motors.asked(0.0, simulation.q[7:], v), v)
+        simulation.step(tau)
+    return tau
 
 
-def _height(reference: Reference, terrain: Terrain, t: float) -> float:
-    """m, of the reference's body over the ground at a time."""
-    p = np.array([np.interp(t, reference.t, reference.q[:, i]) for i in range(3)])
-    return float(p[2] - terrain.height(p))
-
-
-def _fallen(q: Array, wanted: float, terrain: Terrain, standing_height: float, body_down: bool) -> str | None:
+def _fallen(q: Array, wanted: float, ground: Terrain, robot: Robot, body_down: bool) -> str | None:
     """Why this point-foot pose is a fall, if it is one. A reference that lies low (wanted, m) may be followed there."""
-    height = float(q[2] - terrain.height(q[:3]))
+    height = float(q[2] - ground.height(q[:3]))
     tilt = np.degrees(np.arccos(np.clip(1 - 2 * (q[3] ** 2 + q[4] ** 2), -1, 1)))
     if body_down:
         return "the body touches the ground"
-    if height < LOWEST * min(standing_height, wanted):
+    if height < LOWEST * min(robot.standing_height, wanted):
         return f"the body is {height:.2f} m high"
     if tilt > LARGEST_TILT:
         return f"the body tilts by {tilt:.0f} degrees"

@@ -28,6 +28,25 @@ def errors(rollout: Rollout) -> dict[str, float | None]:
     }
 
 
+def estimate(rollout: Rollout) -> dict[str, float | None]:
+    """How far the controller's idea of the body was from the truth, over t >= 0.
+
+    `estimate_rmse`: m, of position.  `estimate_end`: m, at the end, which is the drift.  `estimate_height_rmse`: m, of
+    its vertical part.  `estimate_tilt_rmse`, `estimate_heading_rmse`: degrees.
+    """
+    on = rollout.t >= 0
+    names = ("rmse", "end", "height_rmse", "tilt_rmse", "heading_rmse")
+    if not on.any():
+        return {f"estimate_{name}": None for name in names}
+    off = rollout.body_est[on, :3] - rollout.body[on, :3]
+    distance = np.linalg.norm(off, axis=-1)
+    turn = Rotation.from_quat(rollout.body_est[on, 3:]) * Rotation.from_quat(rollout.body[on, 3:]).inv()
+    w = np.degrees(turn.as_rotvec())  # world axes
+    tilt = np.linalg.norm(w[:, :2], axis=-1)
+    values = (_rms(distance), float(distance[-1]), _rms(off[:, 2]), _rms(tilt), _rms(w[:, 2]))
+    return {f"estimate_{name}": x for name, x in zip(names, values, strict=True)}
+
+
 def solver(rollout: Rollout, *, period: float) -> dict[str, Any]:
     """The controller's wall times.
 

@@ -11,37 +11,47 @@ import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports]
 import trimesh
 
-from slomo.errors import InvalidData, UsageError
+from slomo.errors import InvalidData
 from slomo.robot import Robot
 from slomo.robot_file import find_mesh
 from slomo.terrain import Terrain
+from slomo.track.simulated_ground import add_ground
 
 Array = np.ndarray
 
-# kg m2, rotor inertia seen at the joint: 1.1e-4 kg m2 (rotor links of the Go1's URDF) behind gears of 6.33 (hip,
-# thigh) and 9.5 (calf) gives 0.0045 to 0.010.
-ARMATURE = 0.01
 # (s, damping ratio) of the contact: landing at a walk's speed a foot gives in by 4 mm, as rubber does. Under MuJoCo's
 # default of 0.02 s it is 2 cm, the foot's whole radius.
 CONTACT = (0.005, 1.0)
 SOLE = 0.005  # m, radius of the spheres at the points of a sole
+# Of the standing height: how far above the base a payload's middle is, and how long its box's sides are.
+PAYLOAD_LIFT, PAYLOAD_SIZE = 0.4, 0.4
 GROUND, ROBOT = 1, 2
+IMU = "imu"
 
 
-def build_model(robot: Robot, terrain: Terrain, *, friction: float = 0.8, timestep: float = 1e-3) -> mujoco.MjModel:
-    """Free-floating robot on the ground and its boxes, one torque motor a joint in Pinocchio's joint order.
+def build_model(
+    robot: Robot,
+    terrain: Terrain,
+    *,
+    friction: float = 0.8,
+    timestep: float = 1e-3,
+    payload: float = 0.0,
+    mass_scale: float = 1.0,
+) -> mujoco.MjModel:
+    """Free-floating robot on the ground, one torque motor a joint in Pinocchio's joint order.
 
     Args:
         friction: Coulomb coefficient between any link and the ground.
         timestep: s.
+        payload: kg, on the trunk.  mass_scale: times mass and inertia of every link.
 
     Raises:
         InvalidData: MuJoCo cannot use the URDF.
     """
     try:
         spec = mujoco.MjSpec.from_file(str(robot.urdf))
-        _prepare(spec, robot, friction)
-        _add_ground(spec, terrain, friction)
+        _prepare(spec, robot, friction, _inertias(robot, payload, mass_scale))
+        add_ground(spec, terrain, friction=friction, contype=GROUND, conaffinity=ROBOT, solref=CONTACT)
         spec.option.timestep = timestep
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -50,7 +60,18 @@ def build_model(robot: Robot, terrain: Terrain, *, friction: float = 0.8, timest
         raise InvalidData(f"MuJoCo cannot use it: {e}", where=robot.urdf) from None
 
 
-def _prepare(spec: mujoco.MjSpec, robot: Robot, friction: float) -> None:
+def _inertias(robot: Robot, payload: float, mass_scale: float) -> list[pin.Inertia]:
+    """Of each joint of the model: what moves with it, scaled, and on the root a payload's box."""
+    scaled = [pin.Inertia(y.mass * mass_scale, y.lever, y.inertia * mass_scale) for y in robot.model.inertias]
+    if payload:
+        base = robot.model.frames[robot.model.getFrameId(robot.base)].placement
+        lift = pin.SE3(np.eye(3), np.array([0.0, 0.0, PAYLOAD_LIFT * robot.standing_height]))
+        size = PAYLOAD_SIZE * robot.standing_height
+        scaled[1] = scaled[1] + (base * lift).act(pin.Inertia.FromBox(payload, size, size, size))
+    return scaled
+
+
+def _prepare(spec: mujoco.MjSpec, robot: Robot, friction: float, inertias: list[pin.Inertia]) -> None:
     """Root, inertia, collision shapes and motors."""
     spec.compiler.fusestatic = True
     spec.worldbody.first_body().add_freejoint(name="root")
@@ -69,7 +90,7 @@ def _prepare(spec: mujoco.MjSpec, robot: Robot, friction: float) -> None:
         body.mass, body.inertia, body.fullinertia = 0.0, [0, 0, 0], [np.nan, 0, 0, 0, 0, 0]
         if body.joints:
             name = body.joints[0].name
-            inertia = robot.model.inertias[1 if name == "root" else robot.model.getJointId(name)]
+            inertia = inertias[1 if name == "root" else robot.model.getJointId(name)]
             Y = inertia.inertia
             body.mass, body.ipos = inertia.mass, inertia.lever
             body.fullinertia = [Y[0, 0], Y[1, 1], Y[2, 2], Y[0, 1], Y[0, 2], Y[1, 2]]
@@ -86,14 +107,16 @@ def _prepare(spec: mujoco.MjSpec, robot: Robot, friction: float) -> None:
         centre = np.array(limb.offset) + (radius - limb.foot_radius) * _up(robot, limb.link)
         foot.add_geom(name=limb.foot, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], pos=centre)
         foot.add_site(name=limb.foot, pos=limb.offset)
+    spec.worldbody.first_body().add_site(name=IMU)
+    spec.add_sensor(name=IMU, type=mujoco.mjtSensor.mjSENS_ACCELEROMETER, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=IMU)
     for geom in spec.geoms:
         geom.density = 0  # the links' masses are the URDF's; MuJoCo would add the shapes'
         geom.contype, geom.conaffinity = ROBOT, GROUND
         geom.friction[0] = friction
         geom.solref[:] = CONTACT
-    for name, effort in zip(robot.joint_names, robot.effort, strict=True):
+    for name, effort, inertia in zip(robot.joint_names, robot.effort, robot.rotor_inertia, strict=True):
         joint = spec.joint(name)
-        joint.armature = ARMATURE
+        joint.armature = inertia
         motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         motor.ctrllimited, motor.ctrlrange = True, [-effort, effort]
 
@@ -105,21 +128,6 @@ def _up(robot: Robot, link: str) -> Array:
     return data.oMf[robot.model.getFrameId(link)].rotation[2]
 
 
-def _add_ground(spec: mujoco.MjSpec, terrain: Terrain, friction: float) -> None:
-    if terrain.slopes or terrain.field is not None:
-        raise UsageError("slopes and height fields are planned for, but not simulated", where="terrain")
-    common = {"contype": GROUND, "conaffinity": ROBOT, "friction": [friction, 0.005, 1e-4], "solref": CONTACT}
-    spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], **common)
-    for i, b in enumerate(terrain.boxes):
-        spec.worldbody.add_geom(
-            name=f"box{i}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=[(b.x_min + b.x_max) / 2, (b.y_min + b.y_max) / 2, b.height / 2],
-            size=[(b.x_max - b.x_min) / 2, (b.y_max - b.y_min) / 2, b.height / 2],
-            **common,
-        )
-
-
 class Simulation:
     """The robot's state, one `step` at a time.
 
@@ -127,9 +135,20 @@ class Simulation:
         q: (nq,) and v: (nv,) in Pinocchio's convention.  feet: (C, 3) m, world, foot frames.
     """
 
-    def __init__(self, robot: Robot, terrain: Terrain, *, friction: float = 0.8, timestep: float = 1e-3):
+    def __init__(
+        self,
+        robot: Robot,
+        terrain: Terrain,
+        *,
+        friction: float = 0.8,
+        timestep: float = 1e-3,
+        payload: float = 0.0,
+        mass_scale: float = 1.0,
+    ):
         self.robot = robot
-        self.model = build_model(robot, terrain, friction=friction, timestep=timestep)
+        self.model = build_model(
+            robot, terrain, friction=friction, timestep=timestep, payload=payload, mass_scale=mass_scale
+        )
         self.data = mujoco.MjData(self.model)
         ids = [self.model.joint(name).id for name in robot.joint_names]
         self._qpos, self._qvel = self.model.jnt_qposadr[ids], self.model.jnt_dofadr[ids]
@@ -138,6 +157,7 @@ class Simulation:
         for c, name in enumerate(robot.foot_names):
             self._foot_of_geom[self.model.geom(name).id] = c
         self._root_body = int(self.model.jnt_bodyid[self.model.joint("root").id])
+        self._push_at = robot.model.frames[robot.model.getFrameId(robot.base)].placement.translation
 
     @property
     def time(self) -> float:
@@ -157,6 +177,11 @@ class Simulation:
         return np.concatenate([R.reshape(3, 3).T @ v[:3], v[3:6], v[self._qvel]])
 
     @property
+    def acceleration(self) -> Array:
+        """(3,) m/s^2, specific force at the root link's origin in its frame, in the last step."""
+        return self.data.sensordata[:3].copy()
+
+    @property
     def feet(self) -> Array:
         return self.data.site_xpos[self._sites].copy()
 
@@ -171,6 +196,12 @@ class Simulation:
             self.data.qvel[:3], self.data.qvel[3:6] = R.reshape(3, 3) @ v[:3], v[3:6]
             self.data.qvel[self._qvel] = v[6:]
         mujoco.mj_forward(self.model, self.data)
+
+    def push(self, force: Array) -> None:
+        """From now on a force (3,) N, world, acts on the trunk at the base's origin."""
+        R = self.data.xmat[self._root_body].reshape(3, 3)
+        arm = self.data.xpos[self._root_body] + R @ self._push_at - self.data.xipos[self._root_body]
+        self.data.xfrc_applied[self._root_body] = np.concatenate([force, np.cross(arm, force)])
 
     def step(self, tau: Array) -> None:
         """One time step under joint torques tau (nj,) N m; the motors saturate at their limits."""

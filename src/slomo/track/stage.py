@@ -52,6 +52,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     report = {
         "fell": outcome.fall is not None,
         **metrics.errors(rollout),
+        **metrics.estimate(rollout),
         **metrics.solver(rollout, period=1 / config.mpc_hz),
         "state": config.state,
         "fall": outcome.fall,
