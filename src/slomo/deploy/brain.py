@@ -129,7 +129,7 @@ class InProcess:
             c.sense(sample)
         command, plan = c.command(t), c.plan
         assert plan is not None
-        self._reply = Reply(t, command, *c.estimate, float(plan.t[0]), 1e3 * plan.seconds, plan.status)
+        self._reply = Reply(t, command, *c.estimate(t), float(plan.t[0]), 1e3 * plan.seconds, plan.status)
 
     def answer(self, wait: float) -> Reply | None:
         reply, self._reply = self._reply, None

@@ -16,12 +16,13 @@ from slomo.pointfoot import PointFootModel
 from slomo.robot import Robot
 from slomo.stage import Artifact, Inputs, Progress
 from slomo.store import plain
+from slomo.store.digest import digest_arrays
 from slomo.terrain import Terrain
 from slomo.track import metrics
 from slomo.track.config import Config as TrackConfig
 from slomo.track.joint_space import JointSpace
 from slomo.track.lead_in import with_lead_in
-from slomo.track.loop import reference_at
+from slomo.track.recording import reference_at
 
 Array = np.ndarray
 
@@ -51,6 +52,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
             todo=f"run: slomo deploy --robot {robot.name}",
         )  # fmt: skip
     reference = Reference.from_arrays(upstream.npz["reference.npz"])
+    digest = str(inputs.artifacts["track"].npz["rollout.npz"]["reference_digest"])
     track = TrackConfig(**header["track"])
     lead = {"settle": track.settle, "blend": track.blend}
     terrain = Terrain.from_json(upstream.json["terrain.json"])
@@ -72,13 +74,13 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     files: dict[str, Any] = {}
     if len(controlled) > 1:
         on_twin = bool(np.isfinite(controlled["truth"]).all())
-        estimated = _rollout(controlled, controlled["q_est"], robot, reference, header["reference_digest"])
+        estimated = _rollout(controlled, controlled["q_est"], robot, reference, digest)
         rollout = estimated
         if on_twin:
             first = JointSpace(robot).pose(reference.q[0])
             roots = _aligned(controlled["truth"], first)
             poses = np.hstack([roots, controlled["q"]]).astype(float)
-            rollout = _rollout(controlled, poses, robot, reference, header["reference_digest"])
+            rollout = _rollout(controlled, poses, robot, reference, digest)
             report["estimated"] = metrics.errors(_motion_only(estimated, reference))
         errors = metrics.errors(_motion_only(rollout, reference))
         ratio = {k: None if x is None or not tracked.get(k) else x / tracked[k] for k, x in errors.items()}
@@ -95,9 +97,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
 
 def identity(reference: Any, robot: Robot, config: Config) -> dict[str, Any]:
     """What a run is a run of, as it stands in the log's header and is compared with what is there now."""
-    from slomo.track.stage import reference_digest
-
-    return {"reference_digest": reference_digest(reference), "robot_digest": robot.digest, "config": plain(config)}
+    return {"reference": digest_arrays(reference), "robot": robot.digest, "deploy": plain(config)}
 
 
 def _timing(records: Array) -> dict[str, Any]:

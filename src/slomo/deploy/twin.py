@@ -7,10 +7,9 @@ import socket
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
-import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
 from slomo.deploy.config import HZ
 from slomo.deploy.go1 import DAMPING_KD, TICK_HZ, Go1, RobotState
@@ -19,8 +18,9 @@ from slomo.deploy.wire import Rejected
 from slomo.errors import SlomoError
 from slomo.robot import Robot
 from slomo.terrain import Terrain
+from slomo.track.actuators import Motors
 from slomo.track.joint_space import JointCommand
-from slomo.track.sensors import SensorSample
+from slomo.track.sensors import SensorErrors, SensorSample, SimulatedSensors
 from slomo.track.simulation import Simulation
 
 Array = np.ndarray
@@ -36,13 +36,13 @@ class TwinConfig:
     """How good the twin's sensors are, and what else it reports.
 
     Attributes:
-        noise: of the sensors; 1 is 0.002 rad, 0.05 rad/s, 0.3 N m, 0.01 rad/s (gyro), 0.1 m/s^2 of standard deviation.
+        noise: whether the sensors have the biases, noise and delay of `track.sensors.SensorErrors`.
         friction: of the ground.
         battery: %.  temperature: degrees C, of the motors.
-        seed: of the noise.
+        seed: of biases and noise.
     """
 
-    noise: float = 1.0
+    noise: bool = True
     friction: float = 0.8
     battery: int = 90
     temperature: float = 35.0
@@ -72,9 +72,12 @@ class Twin:
         self.buttons: frozenset[str] = frozenset()
         self.command: JointCommand | None = None
         self._go1 = Go1(robot, scrambled=scrambled)
-        self._rng = np.random.default_rng(config.seed)
+        nj = len(robot.joint_names)
+        errors = SensorErrors() if config.noise else SensorErrors(*[0.0] * len(fields(SensorErrors)))
+        self._sensors = SimulatedSensors(nj, seed=config.seed, errors=errors)
+        self._motors = Motors(robot)
         self._heard = -np.inf
-        self._tau = np.zeros(len(robot.joint_names))
+        self._tau = np.zeros(nj)
         self._steps, self._origin = 0, 0.0
         self.simulation.reset(lying)
         for _ in range(MOTOR_HZ):
@@ -119,25 +122,19 @@ class Twin:
         return sent
 
     def _step(self) -> None:
-        """The motors' PD for one step of the simulation; without a command they brake."""
-        q, v, c = self.simulation.q[7:], self.simulation.v[6:], self.command
+        """The motors' PD, on their own encoders, for one step of the simulation; without a command they brake."""
+        q, v, c = self.simulation.q[7:] + self._sensors.q_bias, self.simulation.v[6:], self.command
         asked = -DAMPING_KD * v if c is None else c.kp * (c.q - q) + c.kd * (c.v - v) + c.tau
-        self._tau = np.clip(asked, -self.robot.effort, self.robot.effort)
+        self._tau = self._motors.limited(asked, v)
         self.simulation.step(self._tau)
         self._steps += 1
 
     def _state(self) -> bytes:
         """What the sensors say now, and where the robot truly is."""
-        q, v = self.simulation.q, self.simulation.v
-        R = pin.Quaternion(q[6], q[3], q[4], q[5]).matrix()
-        force = R.T @ (self.simulation.data.qacc[:3] + [0, 0, 9.81])
-        noisy = lambda x, sigma: x + self._rng.normal(0, sigma * self.config.noise, x.shape)  # noqa: E731
-        sample = SensorSample(
-            t=0.0, q=noisy(q[7:], 0.002), v=noisy(v[6:], 0.05), tau=noisy(self._tau, 0.3), gyro=noisy(v[3:6], 0.01),
-            acceleration=noisy(force, 0.1), quat_xyzw=q[3:7],
-        )  # fmt: skip
+        q, v, t = self.simulation.q, self.simulation.v, self._steps / MOTOR_HZ
+        sample = self._sensors.read(SensorSample(t, q[7:], v[6:], self._tau, v[3:6], self.simulation.acceleration))
         state = RobotState(
-            sample=sample,
+            sample=replace(sample, quat_xyzw=q[3:7]),
             tick=round(self._steps * TICK_HZ / MOTOR_HZ),
             temperature=np.full(len(v) - 6, self.config.temperature),
             foot_force=self.simulation.contacts()[0][:, 2],

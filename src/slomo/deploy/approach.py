@@ -1,0 +1,144 @@
+"""From the robot's own stand into a motion and back: a crawl before and after it, for the controller to follow.
+
+A motion begins and ends with its feet somewhere; a robot stands up and lies down with its feet below its hips. Between
+the two it sets one foot after the other, the centre of mass over the other three.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from slomo.deploy.postures import smooth
+from slomo.motion import Reference
+from slomo.pointfoot import PointFootModel
+from slomo.robot import Robot
+from slomo.terrain import Terrain
+from slomo.track.lead_in import balance
+
+Array = np.ndarray
+
+SHIFT, SWING, LIFT = 0.4, 0.4, 0.05  # s, s, m: of a step
+STAY = 0.01  # m, by which a foot may be elsewhere without a step
+ORDER = (2, 0, 3, 1)  # limbs: hind left, front left, hind right, front right
+
+
+@dataclass(frozen=True)
+class _Pose:
+    """position: (3,) m.  rotation: of the body.  feet: (C, 3) m."""
+
+    position: Array
+    rotation: Rotation
+    feet: Array
+
+
+def with_approach(reference: Reference, robot: Robot, model: PointFootModel, *, terrain: Terrain) -> Reference:
+    """The reference between two stands, the robot's feet below its hips and its body level.
+
+    Args:
+        reference: begins and ends at rest with every foot on the ground; its times are kept, so the approach is before
+            its first and the way back after its last.
+    """
+    first, last = _pose(reference, 0), _pose(reference, -1)
+    home, end = (_stand(robot, pose, terrain) for pose in (first, last))
+    before = _filled(list(_crawl(home, first, model)), reference, model, terrain)
+    after = _filled(list(_crawl(last, end, model)), reference, model, terrain)
+    parts = (before, reference, after)
+    starts = (reference.t[0] - before.t[-1], 0.0, reference.t[-1])
+    # Each part ends where the next one begins.
+    rows = [slice(None, -1), slice(None), slice(1, None)]
+    return replace(
+        reference,
+        t=np.concatenate([p.t[r] + s for p, r, s in zip(parts, rows, starts, strict=True)]),
+        q=np.concatenate([p.q[r] for p, r in zip(parts, rows, strict=True)]),
+        v=np.concatenate([p.v[r] for p, r in zip(parts, rows, strict=True)]),
+        **{name: np.concatenate([getattr(p, name) for p in parts]) for name in ("h", "u", "lam")},
+    )
+
+
+def at_rest(reference: Reference, model: PointFootModel, *, terrain: Terrain, seconds: float) -> Reference:
+    """The reference and after it `seconds` at rest in its last pose, with the feet that are in the air set down."""
+    pose = _pose(reference, -1)
+    down = pose.feet.copy()
+    down[:, 2] = terrain.height(down)
+    steps = [(min(seconds, SWING), pose, replace(pose, feet=down)), (seconds, replace(pose, feet=down), None)]
+    rest = _filled([(T, a, b or a, None) for T, a, b in steps], reference, model, terrain)
+    return replace(
+        reference,
+        t=np.concatenate([reference.t, reference.t[-1] + rest.t[1:]]),
+        **{n: np.concatenate([getattr(reference, n), getattr(rest, n)[1:]]) for n in ("q", "v")},
+        **{n: np.concatenate([getattr(reference, n), getattr(rest, n)]) for n in ("h", "u", "lam")},
+    )
+
+
+def _pose(reference: Reference, k: int) -> _Pose:
+    q = reference.q[k]
+    return _Pose(q[:3], Rotation.from_quat(q[3:7]), q[7:].reshape(-1, 3))
+
+
+def _stand(robot: Robot, near: _Pose, terrain: Terrain) -> _Pose:
+    """The robot's own stand, its feet about where those of `near` are and headed the same way."""
+    yaw = Rotation.from_euler("z", near.rotation.as_euler("ZYX")[0])
+    feet = yaw.apply(robot.nominal_feet * [1, 1, 0])
+    shift = (near.feet - feet).mean(axis=0) * [1, 1, 0]
+    feet = feet + shift
+    feet[:, 2] = terrain.height(feet)
+    return _Pose(shift + [0, 0, robot.standing_height + feet[:, 2].mean()], yaw, feet)
+
+
+# A step of the crawl: seconds, from, to, and the foot that swings.
+_Step = tuple[float, _Pose, _Pose, int | None]
+
+
+def _crawl(start: _Pose, goal: _Pose, model: PointFootModel) -> Iterable[_Step]:
+    """Set the feet one by one from where they are in `start` to where they are in `goal`."""
+    at = start
+    moving = [c for c in ORDER if np.linalg.norm(goal.feet[c] - at.feet[c]) > STAY]
+    height = (start.position[2] - start.feet[:, 2].mean() + goal.position[2] - goal.feet[:, 2].mean()) / 2
+    for c in moving:
+        over = np.delete(at.feet, c, axis=0).mean(axis=0)
+        total = model.mass + model.foot_mass.sum()
+        over = (total * over - model.foot_mass @ at.feet) / model.mass
+        over[2] = height + at.feet[:, 2].mean()
+        shifted = replace(at, position=over)
+        yield SHIFT, at, shifted, None
+        feet = at.feet.copy()
+        feet[c] = goal.feet[c]
+        at = replace(shifted, feet=feet)
+        yield SWING, shifted, at, c
+    yield SHIFT, at, goal, None
+
+
+def _filled(steps: list[_Step], like: Reference, model: PointFootModel, terrain: Terrain) -> Reference:
+    """The steps as a reference from t = 0, in time steps like `like`'s, with forces of near-static balance."""
+    h = float(np.median(like.h))
+    q, v, stance = [], [], []
+    for T, a, b, swings in steps:
+        n = max(2, round(T / h))
+        turn = (a.rotation.inv() * b.rotation).as_rotvec()
+        for k in range(n):
+            s, rate = smooth(k / n)
+            rate /= n * h
+            feet, speeds = a.feet + s * (b.feet - a.feet), rate * (b.feet - a.feet)
+            if swings is not None:
+                feet[swings, 2] += LIFT * np.sin(np.pi * k / n) ** 2
+                speeds[swings, 2] += LIFT * np.pi / (n * h) * np.sin(2 * np.pi * k / n)
+            position, rotation = a.position + s * (b.position - a.position), a.rotation * Rotation.from_rotvec(s * turn)
+            q.append(np.concatenate([position, rotation.as_quat(), feet.ravel()]))
+            v.append(np.concatenate([rate * (b.position - a.position), rate * turn, speeds.ravel()]))
+            stance.append(feet[:, 2] - terrain.height(feet) < 0.005)
+    _, _, end, _ = steps[-1]
+    q.append(np.concatenate([end.position, end.rotation.as_quat(), end.feet.ravel()]))
+    v.append(np.zeros_like(v[-1]))
+    x = np.array(q)
+    x[1:, 3:7] *= np.cumprod(np.where(np.sum(x[1:, 3:7] * x[:-1, 3:7], axis=1) < 0, -1.0, 1.0))[:, None]
+    acceleration = np.gradient(np.array(v)[:, :3], h, axis=0)
+    on = np.array(stance)
+    u = np.array(
+        [balance(model, r[:3], r[7:].reshape(-1, 3), s, a) for r, s, a in zip(x, on, acceleration, strict=False)]
+    )
+    lam = np.where(on[..., None], u + model.foot_mass[:, None] * [0, 0, model.g], 0.0)
+    return replace(
+        like, t=np.arange(len(x)) * h, h=np.full(len(x) - 1, h), q=x, v=np.array(v), u=u.reshape(len(u), -1), lam=lam
+    )
