@@ -15,12 +15,13 @@ from slomo.motion import Reference
 from slomo.pointfoot import PointFootModel
 from slomo.robot import Robot
 from slomo.terrain import Terrain
-from slomo.track.lead_in import balance
+from slomo.track.config import Config as TrackConfig
+from slomo.track.lead_in import balance, with_lead_in
 
 Array = np.ndarray
 
 SHIFT, SWING, LIFT = 0.4, 0.4, 0.05  # s, s, m: of a step
-STAY = 0.01  # m, by which a foot may be elsewhere without a step
+STAY = 2e-3  # m, by which a foot may be elsewhere without a step
 ORDER = (2, 0, 3, 1)  # limbs: hind left, front left, hind right, front right
 
 
@@ -33,42 +34,35 @@ class _Pose:
     feet: Array
 
 
-def with_approach(reference: Reference, robot: Robot, model: PointFootModel, *, terrain: Terrain) -> Reference:
+def with_approach(
+    reference: Reference, robot: Robot, *, terrain: Terrain, track: TrackConfig, rest: float
+) -> Reference:
     """The reference between two stands, the robot's feet below its hips and its body level.
 
-    Args:
-        reference: begins and ends at rest with every foot on the ground; its times are kept, so the approach is before
-            its first and the way back after its last.
+    Before the motion's start, at negative times: the crawl, then the lead-in. After its end: `rest` (s) at rest in the
+    last pose, with the feet that are in the air set down, then the crawl back.
     """
-    first, last = _pose(reference, 0), _pose(reference, -1)
-    home, end = (_stand(robot, pose, terrain) for pose in (first, last))
-    before = _filled(list(_crawl(home, first, model)), reference, model, terrain)
-    after = _filled(list(_crawl(last, end, model)), reference, model, terrain)
-    parts = (before, reference, after)
-    starts = (reference.t[0] - before.t[-1], 0.0, reference.t[-1])
-    # Each part ends where the next one begins.
-    rows = [slice(None, -1), slice(None), slice(1, None)]
-    return replace(
-        reference,
-        t=np.concatenate([p.t[r] + s for p, r, s in zip(parts, rows, starts, strict=True)]),
-        q=np.concatenate([p.q[r] for p, r in zip(parts, rows, strict=True)]),
-        v=np.concatenate([p.v[r] for p, r in zip(parts, rows, strict=True)]),
-        **{name: np.concatenate([getattr(p, name) for p in parts]) for name in ("h", "u", "lam")},
-    )
-
-
-def at_rest(reference: Reference, model: PointFootModel, *, terrain: Terrain, seconds: float) -> Reference:
-    """The reference and after it `seconds` at rest in its last pose, with the feet that are in the air set down."""
-    pose = _pose(reference, -1)
-    down = pose.feet.copy()
+    model = PointFootModel.from_robot(robot, mu=track.mu)
+    led = with_lead_in(reference, model, terrain=terrain, settle=track.settle, blend=track.blend)
+    first, last = _pose(led, 0), _pose(led, -1)
+    down = last.feet.copy()
     down[:, 2] = terrain.height(down)
-    steps = [(min(seconds, SWING), pose, replace(pose, feet=down)), (seconds, replace(pose, feet=down), None)]
-    rest = _filled([(T, a, b or a, None) for T, a, b in steps], reference, model, terrain)
+    landed = replace(last, feet=down)
+    home, end = (_stand(robot, pose, terrain) for pose in (first, landed))
+    before = _filled(list(_crawl(home, first, model)), led, model, terrain)
+    stay = [(SWING, last, landed, None), (rest, landed, landed, None)]
+    after = _filled([*stay, *_crawl(landed, end, model)], led, model, terrain)
+    # Each part ends where the next one begins.
+    parts = ((before, led.t[0] - before.t[-1], slice(-1)), (led, 0.0, slice(None)), (after, led.t[-1], slice(1, None)))
+    q = np.concatenate([part.q[rows] for part, _, rows in parts])
+    q[1:, 3:7] *= np.cumprod(np.where(np.sum(q[1:, 3:7] * q[:-1, 3:7], axis=1) < 0, -1.0, 1.0))[:, None]
     return replace(
         reference,
-        t=np.concatenate([reference.t, reference.t[-1] + rest.t[1:]]),
-        **{n: np.concatenate([getattr(reference, n), getattr(rest, n)[1:]]) for n in ("q", "v")},
-        **{n: np.concatenate([getattr(reference, n), getattr(rest, n)]) for n in ("h", "u", "lam")},
+        t=np.concatenate([part.t[rows] + start for part, start, rows in parts]),
+        q=q,
+        v=np.concatenate([part.v[rows] for part, _, rows in parts]),
+        **{name: np.concatenate([getattr(part, name) for part, _, _ in parts]) for name in ("h", "u", "lam")},
+        cycle=np.zeros(0),
     )
 
 
@@ -132,7 +126,6 @@ def _filled(steps: list[_Step], like: Reference, model: PointFootModel, terrain:
     q.append(np.concatenate([end.position, end.rotation.as_quat(), end.feet.ravel()]))
     v.append(np.zeros_like(v[-1]))
     x = np.array(q)
-    x[1:, 3:7] *= np.cumprod(np.where(np.sum(x[1:, 3:7] * x[:-1, 3:7], axis=1) < 0, -1.0, 1.0))[:, None]
     acceleration = np.gradient(np.array(v)[:, :3], h, axis=0)
     on = np.array(stance)
     u = np.array(

@@ -16,6 +16,7 @@ from typing import Protocol
 
 import numpy as np
 
+from slomo.deploy.approach import with_approach
 from slomo.errors import SlomoError
 from slomo.motion import Reference
 from slomo.terrain import Terrain
@@ -91,19 +92,22 @@ class Brain(Protocol):
 
 @dataclass(frozen=True)
 class Task:
-    """Everything that a controller is made from; can be sent to another process."""
+    """Everything that a controller is made from; can be sent to another process. rest: see `with_approach`."""
 
     robot: str
     reference: Reference
     terrain: Terrain
     config: Config
+    rest: float
 
     def make(self):
         """The controller, compiled."""
         from slomo.robot import load_robot
         from slomo.track.controller import Controller
 
-        controller = Controller(load_robot(self.robot), self.reference, terrain=self.terrain, config=self.config)
+        robot = load_robot(self.robot)
+        reference = with_approach(self.reference, robot, terrain=self.terrain, track=self.config, rest=self.rest)
+        controller = Controller(robot, reference, terrain=self.terrain, config=self.config)
         controller.warm_up()
         return controller
 

@@ -13,9 +13,9 @@ class Config:
 
     Attributes:
         listen: s, of states before anything moves.
-        fold: s, from the pose in which the robot lies to a crouch.  rise: s, from there to the motion's first pose.
-        stand: s, in that pose before the motion.  blend: s, from the stand's command to the controller's.
-        stop: s, after the motion's end, in which the controller brings the robot to rest.
+        fold: s, from the pose in which the robot lies to a crouch.  rise: s, from there to a stand.
+        stand: s, so before the controller takes over.  blend: s, from the stand's command to the controller's.
+        rest: s, after the motion's end, before the feet are set below the hips again.
         lower: s, down to a crouch.  damp: s, of damping before the end.
         stand_kp: N m/rad, stand_kd: N m s/rad: motor PD of standing up and lying down.
         stale: s, age of the newest state from which the robot is damped.
@@ -35,7 +35,7 @@ class Config:
     rise: float = 1.5
     stand: float = 0.5
     blend: float = 0.2
-    stop: float = 1.0
+    rest: float = 0.5
     lower: float = 1.5
     damp: float = 1.0
     stand_kp: float = 60.0
@@ -62,7 +62,7 @@ def check(config: Config) -> None:
     for name in positive:
         if not getattr(config, name) > 0:
             raise UsageError(f"needs a number above 0, got {getattr(config, name)}", where=f"deploy.{name}")
-    for name in ("stand", "stop", "damp", "stand_kd", "min_height", "beyond_limit", "min_battery"):
+    for name in ("stand", "rest", "damp", "stand_kd", "min_height", "beyond_limit", "min_battery"):
         if not getattr(config, name) >= 0:
             raise UsageError(f"needs a number of at least 0, got {getattr(config, name)}", where=f"deploy.{name}")
     if config.listen < 0.2:

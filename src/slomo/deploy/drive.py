@@ -13,7 +13,7 @@ from slomo.deploy.link import Clock, Link
 from slomo.deploy.log import SENT, Log
 from slomo.deploy.postures import Postures, blend
 from slomo.deploy.receiver import Receiver
-from slomo.deploy.sequence import ANSWER, CONTROLLED, ORDER, UPRIGHT, Phase, Sequence
+from slomo.deploy.sequence import ANSWER, ORDER, UPRIGHT, Phase, Sequence
 from slomo.deploy.supervisor import CAUSES, Cause, Supervisor, Trip
 from slomo.robot import Robot
 from slomo.track.joint_space import JointCommand
@@ -121,7 +121,7 @@ class Drive:
             return None
         wanted = sequence.posture(now)
         try:
-            if sequence.phase in CONTROLLED:
+            if sequence.phase == Phase.PLAY:
                 wanted = self._controlled(now, wanted)
         except Died as e:
             supervisor.stop(Cause.DEAD, now, str(e))
@@ -173,7 +173,7 @@ class Drive:
         if reply is None:
             return None
         self._reply = reply
-        share = (now - self.sequence.since) / self.config.blend if self.sequence.phase == Phase.PLAY else 1.0
+        share = (now - self.sequence.since) / self.config.blend
         return blend(stand, reply.command, share) if stand and share < 1 else reply.command
 
     def _let_down(self) -> None:
@@ -197,7 +197,7 @@ class Drive:
         r["phase"], r["sent"] = ORDER.index(self.sequence.phase), SENT.index(sent)
         trip = self.supervisor.trip
         r["trip"], r["why"] = (1 + CAUSES.index(trip.cause), str(trip).encode()[:120]) if trip else (0, b"")
-        r["reference_t"] = now + self._shift if self.sequence.phase in CONTROLLED else np.nan
+        r["reference_t"] = now + self._shift if self.sequence.phase == Phase.PLAY else np.nan
         if state:
             s = state.sample
             r["state_t"], r["tick"], r["battery"] = s.t - self._begin, state.tick, state.battery
@@ -211,7 +211,7 @@ class Drive:
         if reply:
             r["q_est"], r["v_est"] = reply.q, reply.v
             r["mpc_t"], r["mpc_ms"], r["mpc_status"] = reply.mpc_t, reply.mpc_ms, reply.mpc_status
-        r["held"] = self._held and self.sequence.phase in CONTROLLED
+        r["held"] = self._held and self.sequence.phase == Phase.PLAY
         counts = self._receiver.counts
         r["accepted"], r["rejected"] = counts["accepted"], counts.total() - counts["accepted"]
         self.log.append()

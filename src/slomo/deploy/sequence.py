@@ -23,14 +23,12 @@ class Phase(StrEnum):
     RISE = "rise"
     STAND = "stand"
     PLAY = "play"
-    STOP = "stop"
     LOWER = "lower"
     DAMP = "damp"
 
 
 ORDER = tuple(Phase)
-CONTROLLED = (Phase.PLAY, Phase.STOP)
-UPRIGHT = (Phase.STAND, *CONTROLLED)
+UPRIGHT = (Phase.STAND, Phase.PLAY)
 
 
 @dataclass
@@ -60,7 +58,7 @@ class Sequence:
         c = self.config
         return {
             Phase.LISTEN: c.listen, Phase.FOLD: c.fold, Phase.RISE: c.rise, Phase.STAND: c.stand,
-            Phase.PLAY: self.seconds, Phase.STOP: c.stop, Phase.LOWER: c.lower, Phase.DAMP: c.damp,
+            Phase.PLAY: self.seconds, Phase.LOWER: c.lower, Phase.DAMP: c.damp,
         }[self.phase]  # fmt: skip
 
     def over(self, now: float) -> bool:

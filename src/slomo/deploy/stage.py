@@ -5,14 +5,14 @@ from typing import Any
 import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
+from slomo.deploy.approach import with_approach
 from slomo.deploy.config import HZ, Config
 from slomo.deploy.log import read
 from slomo.deploy.mcap_file import to_mcap
-from slomo.deploy.sequence import CONTROLLED, ORDER, Phase
+from slomo.deploy.sequence import ORDER, Phase
 from slomo.deploy.supervisor import CAUSES, Cause
 from slomo.errors import MissingInput
 from slomo.motion import Reference, Rollout
-from slomo.pointfoot import PointFootModel
 from slomo.robot import Robot
 from slomo.stage import Artifact, Inputs, Progress
 from slomo.store import plain
@@ -21,7 +21,6 @@ from slomo.terrain import Terrain
 from slomo.track import metrics
 from slomo.track.config import Config as TrackConfig
 from slomo.track.joint_space import JointSpace
-from slomo.track.lead_in import with_lead_in
 from slomo.track.recording import reference_at
 
 Array = np.ndarray
@@ -54,11 +53,11 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     reference = Reference.from_arrays(upstream.npz["reference.npz"])
     digest = str(inputs.artifacts["track"].npz["rollout.npz"]["reference_digest"])
     track = TrackConfig(**header["track"])
-    lead = {"settle": track.settle, "blend": track.blend}
     terrain = Terrain.from_json(upstream.json["terrain.json"])
-    reference = with_lead_in(reference, PointFootModel.from_robot(robot, mu=track.mu), terrain=terrain, **lead)
+    end = float(reference.t[-1])
+    reference = with_approach(reference, robot, terrain=terrain, track=track, rest=config.rest)
 
-    controlled = records[np.isin(records["phase"], [ORDER.index(phase) for phase in CONTROLLED])]
+    controlled = records[records["phase"] == ORDER.index(Phase.PLAY)]
     why = str(records["why"][-1].decode(errors="replace")) if records["trip"][-1] else None
     if why is None and ORDER[records["phase"][-1]] != Phase.DAMP:
         why = f"the program was cut off during {ORDER[records['phase'][-1]]!s}"
@@ -81,8 +80,8 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
             roots = _aligned(controlled["truth"], first)
             poses = np.hstack([roots, controlled["q"]]).astype(float)
             rollout = _rollout(controlled, poses, robot, reference, digest)
-            report["estimated"] = metrics.errors(_motion_only(estimated, reference))
-        errors = metrics.errors(_motion_only(rollout, reference))
+            report["estimated"] = metrics.errors(_motion_only(estimated, end))
+        errors = metrics.errors(_motion_only(rollout, end))
         ratio = {k: None if x is None or not tracked.get(k) else x / tracked[k] for k, x in errors.items()}
         report |= errors | metrics.solver(rollout, period=1 / track.mpc_hz)
         report |= {"state": "truth of the twin" if on_twin else "estimated", "over_track": ratio}
@@ -121,10 +120,10 @@ def _timing(records: Array) -> dict[str, Any]:
     }
 
 
-def _motion_only(rollout: Rollout, reference: Reference) -> Rollout:
-    """The roll-out without what comes after the motion's end."""
-    end = int(np.searchsorted(rollout.t, reference.t[-1] + 1e-9))
-    rows = ("t", "q", "v", "q_des", "tau", "body", "points", "lam", "body_ref", "points_ref")
+def _motion_only(rollout: Rollout, seconds: float) -> Rollout:
+    """The roll-out without what comes after the motion's end at `seconds`; what comes before has negative times."""
+    end = int(np.searchsorted(rollout.t, seconds + 1e-9))
+    rows = ("t", "q", "v", "q_des", "tau", "body", "points", "lam", "body_ref", "points_ref", "body_est")
     arrays = rollout.to_arrays()
     return Rollout.from_arrays({**arrays, **{name: arrays[name][:end] for name in rows}})
 
@@ -132,6 +131,7 @@ def _motion_only(rollout: Rollout, reference: Reference) -> Rollout:
 def _rollout(records: Array, q: Array, robot: Robot, reference: Reference, digest: str) -> Rollout:
     joints = JointSpace(robot)
     points = np.array([joints.state(x, v)[0] for x, v in zip(q, records["v_est"], strict=True)])
+    estimated = np.array([joints.state(x, v)[0] for x, v in zip(records["q_est"], records["v_est"], strict=True)])
     t = records["reference_t"]
     wanted = reference_at(reference, t)
     plans = np.flatnonzero(np.diff(records["mpc_t"], prepend=-np.inf))
@@ -143,7 +143,7 @@ def _rollout(records: Array, q: Array, robot: Robot, reference: Reference, diges
         body_ref=wanted[:, :7], points_ref=wanted[:, 7:].reshape(len(t), -1, 3),
         mpc_t=records["mpc_t"][plans], mpc_ms=records["mpc_ms"][plans].astype(float),
         mpc_status=records["mpc_status"][plans].astype(int),
-        point_names=robot.foot_names, joint_names=robot.joint_names, reference_digest=digest,
+        body_est=estimated[:, :7], point_names=robot.foot_names, joint_names=robot.joint_names, reference_digest=digest,
     )  # fmt: skip
 
 
