@@ -4,7 +4,7 @@ import sys
 
 import typer
 
-from slomo.cli import export, project, stages, tools
+from slomo.cli import deploy, export, project, stages, tools
 
 app = typer.Typer(
     name="slomo",
@@ -19,6 +19,7 @@ app = typer.Typer(
 )
 stages.add_commands(app)
 project.add_commands(app)
+deploy.add_commands(app)
 export.add_commands(app)
 tools.add_commands(app)
 

@@ -33,7 +33,8 @@ def _all_states(session: Session, robot: str | None) -> "dict[str, State]":
                 raise
             session.console.note(str(e))
             continue
-        found |= {s.label: s for s in states(own, "report").values()}
+        lasts = ("report", "deploy") if own.given("deploy_log") else ("report",)
+        found |= {s.label: s for last in lasts for s in states(own, last).values()}
     return found
 
 

@@ -64,6 +64,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     report: dict[str, Any] = {
         "transport": header["transport"],
         "address": header["address"],
+        "dry_run": header["dry_run"],
         "priority": header["priority"],
         "trip": why,
         "cause": str(CAUSES[records["trip"][-1] - 1]) if records["trip"][-1] else None,
