@@ -96,10 +96,11 @@ class Drive:
 
     def _wait(self) -> None:
         """Until the next tick; those for which it is too late are left out."""
+        self._next += PERIOD
         skipped = max(0, int((self.clock.now() - self._next) / PERIOD))
+        self._next += skipped * PERIOD
         self._missed += skipped
         self._ticks += 1
-        self._next += (1 + skipped) * PERIOD
         self.clock.sleep_until(self._next)
 
     def _receive(self) -> None:

@@ -96,10 +96,9 @@ class Log:
         """Write `record`, which the caller has filled in."""
         self._number += 1
         self.record["number"] = self._number
-        data = self.record.tobytes()
-        check = zlib.crc32(data[_CHECKED:]).to_bytes(4, "little")
+        data = self.record.tobytes()[_CHECKED:]
         at = HEADER + (self._number - 1) % self.capacity * RECORD.itemsize
-        self._map[at : at + RECORD.itemsize] = check + data[_CHECKED:]
+        self._map[at : at + RECORD.itemsize] = zlib.crc32(data).to_bytes(4, "little") + data
 
     def close(self) -> None:
         """To the disk, without the part of the ring that was never reached."""

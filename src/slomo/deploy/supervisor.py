@@ -7,6 +7,7 @@ through. Two causes leave time to lie down first (`landing`): a hot motor and a 
 from collections import deque
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from math import acos, degrees
 
 import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports]
@@ -97,6 +98,7 @@ class Supervisor:
         self._fresh = -np.inf
         self._least_height = config.min_height * min(robot.standing_height, lowest)
         self._data = robot.model.createData()
+        self._base = robot.model.getFrameId(robot.base)
         self._feet = [robot.model.getFrameId(name) for name in robot.foot_names]
 
     def stop(self, cause: Cause, now: float, detail: str) -> None:
@@ -124,11 +126,11 @@ class Supervisor:
         self._joint(Cause.TORQUE, np.abs(s.tau) - TORQUE_MARGIN * limits.effort, s.tau, "N m", arrival)
         dt = min(max(s.t - before.sample.t, 0.0), POWER_SECONDS) if before else 0.0
         self._power += dt / POWER_SECONDS * (float(np.abs(s.tau * s.v).sum()) - self._power)
-        self._persist(Cause.POWER, self._power > c.max_power, f"{self._power:.0f} W", arrival)
-        self._persist(Cause.ATTITUDE, s.quat_xyzw is None, "its quaternion is not of length 1", arrival)
+        self._persist(Cause.POWER, self._power > c.max_power, "{:.0f} W", self._power, arrival)
+        self._persist(Cause.ATTITUDE, s.quat_xyzw is None, "its quaternion is not of length 1", 0.0, arrival)
         if s.quat_xyzw is not None:
             self._posture(s.q, s.quat_xyzw, arrival)
-        hottest = int(np.argmax(state.temperature))
+        hottest = int(state.temperature.argmax())
         if self._lasting(Cause.TEMPERATURE, state.temperature[hottest] > c.max_temperature):
             detail = f"{limits.joint_names[hottest]} has {state.temperature[hottest]:.0f} degrees C"
             self._land(Cause.TEMPERATURE, arrival, detail)
@@ -205,26 +207,26 @@ class Supervisor:
 
     def _posture(self, q: Array, quat_xyzw: Array, now: float) -> None:
         tilt = _tilt(quat_xyzw)
-        self._persist(Cause.TILT, tilt > self.config.max_tilt, f"by {tilt:.0f} degrees", now)
+        self._persist(Cause.TILT, tilt > self.config.max_tilt, "by {:.0f} degrees", tilt, now)
         if not self.upright:
             return
-        whole = np.concatenate([np.zeros(3), quat_xyzw, q])
-        pin.framesForwardKinematics(self.robot.model, self._data, whole)
-        base = self._data.oMf[self.robot.model.getFrameId(self.robot.base)].translation[2]
-        height = float(base - min(self._data.oMf[foot].translation[2] for foot in self._feet))
-        self._persist(Cause.HEIGHT, height < self._least_height, f"{height:.2f} m over the lowest foot", now)
+        model, data = self.robot.model, self._data
+        pin.framesForwardKinematics(model, data, np.concatenate([np.zeros(3), quat_xyzw, q]))
+        height = data.oMf[self._base].translation[2] - min(data.oMf[foot].translation[2] for foot in self._feet)
+        low = height < self._least_height
+        self._persist(Cause.HEIGHT, low, "{:.2f} m over the lowest foot", height, now)
 
     def _land(self, cause: Cause, now: float, detail: str) -> None:
         if self.landing is None:
             self.landing = Trip(cause, now, detail)
 
     def _joint(self, cause: Cause, excess: Array, x: Array, unit: str, now: float) -> None:
-        worst = int(np.argmax(excess))
-        self._persist(cause, excess[worst] > 0, f"{self.robot.joint_names[worst]} {x[worst]:.2f} {unit}", now)
+        worst = int(excess.argmax())
+        self._persist(cause, excess[worst] > 0, f"{self.robot.joint_names[worst]} {{:.2f}} {unit}", x[worst], now)
 
-    def _persist(self, cause: Cause, bad: bool, detail: str, now: float) -> None:
+    def _persist(self, cause: Cause, bad: bool, detail: str, value: float, now: float) -> None:
         if self._lasting(cause, bad):
-            self.stop(cause, now, detail)
+            self.stop(cause, now, detail.format(value))
 
     def _lasting(self, cause: Cause, bad: bool) -> bool:
         self._in_a_row[cause] = self._in_a_row.get(cause, 0) + 1 if bad else 0
@@ -233,7 +235,8 @@ class Supervisor:
 
 def _tilt(quat_xyzw: Array) -> float:
     """Degrees between the body's z axis and the vertical."""
-    return float(np.degrees(np.arccos(np.clip(1 - 2 * (quat_xyzw[0] ** 2 + quat_xyzw[1] ** 2), -1, 1))))
+    x, y, _, _ = quat_xyzw.tolist()
+    return degrees(acos(max(-1.0, min(1.0, 1 - 2 * (x * x + y * y)))))
 
 
 def _first_bad(name: str, x: Array) -> int:
