@@ -9,7 +9,7 @@ from slomo.motion import Reference
 from slomo.optimize import dynamics
 from slomo.optimize.dynamics import Body
 from slomo.terrain import Terrain
-from slomo.track.mpc import Mpc
+from slomo.track.mpc import Mpc, MpcConfig
 from test_optimize import MODEL, ROBOT, optimize, trot
 
 
@@ -18,11 +18,11 @@ def reference() -> Reference:
     return Reference.from_arrays(optimize(trot(duration=1.5)).npz["reference.npz"])
 
 
-def run(reference, *, noise=0.0, push=0.0, mass=1.0, feedback=True, replan=True, seed=0):
+def run(reference, *, noise=0.0, push=0.0, mass=1.0, feedback=True, replan=True, seed=0, **config):
     """Body and foot errors (K, 2), m, every 10 ms of the reference, and the last plan. The plant steps at 1 kHz."""
     rng = np.random.default_rng(seed)
     plant = Body.of(replace(MODEL, mass=MODEL.mass * mass, mu=0.8))
-    mpc = Mpc(MODEL, reference, terrain=Terrain())
+    mpc = Mpc(MODEL, reference, terrain=Terrain(), config=MpcConfig(**config))
     mpc.warm_up()
     q, v = reference.q[0].copy(), reference.v[0].copy()
     q1, v1, lam = np.empty_like(q), np.empty_like(v), np.zeros((4, 3))
@@ -46,8 +46,9 @@ def run(reference, *, noise=0.0, push=0.0, mass=1.0, feedback=True, replan=True,
     return np.array(errors), plan
 
 
-def test_follows_the_reference(reference):
-    errors, plan = run(reference)
+@pytest.mark.parametrize("model", ["ncp", "lcp"])
+def test_follows_the_reference(reference, model):
+    errors, plan = run(reference, mpc_model=model)
     assert errors[:, 0].max() < 0.02
     assert errors[:, 1].mean() < 0.02
     assert plan.status == 0
@@ -67,11 +68,12 @@ def test_noise(reference, seed):
     assert run(reference, noise=1.0, seed=seed)[0][:, 0].max() < 0.04
 
 
-def test_push_and_mass(reference):
-    pushed = run(reference, push=6.0)[0][:, 0]
+@pytest.mark.parametrize("model", ["ncp", "lcp"])
+def test_push_and_mass(reference, model):
+    pushed = run(reference, push=6.0, mpc_model=model)[0][:, 0]
     assert pushed.max() > 0.015
     assert pushed[-10:].mean() < 0.05
-    assert run(reference, mass=1.2)[0][:, 0].max() < 0.05
+    assert run(reference, mass=1.2, mpc_model=model)[0][:, 0].max() < 0.05
 
 
 def test_plan_between_its_knots(reference):

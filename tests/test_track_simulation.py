@@ -8,7 +8,7 @@ import pytest
 from slomo.robot import load_robot
 from slomo.terrain import Box, Terrain
 from slomo.track.joint_space import JointSpace
-from slomo.track.mpc import PlanPoint
+from slomo.track.plan import PlanPoint
 from slomo.track.simulation import Simulation
 
 NAMES = ("go1", "a1", "go2")

@@ -30,7 +30,7 @@ class StageSpec:
         files: roles of the user's files that it takes (see `settings.INPUTS`); `optional` ones where they are given.
         robot: whether it takes the robot.
         inspects: whether it also takes an artifact that failed, to show it.
-        shares: parameters that are those of `reconstruct` unless its own section sets them; `ALL` of them.
+        shares: parameters that are those of the stage `lender` unless its own section sets them; `ALL` that both have.
         command: what the user types to make its artifact.
     """
 
@@ -46,6 +46,7 @@ class StageSpec:
     robot: bool = False
     inspects: bool = False
     shares: tuple[str, ...] = ()
+    lender: str = "reconstruct"
 
     def of_module(self, name: str) -> Any:
         """An attribute of the stage's module, which is imported only now: some take seconds."""
@@ -103,6 +104,14 @@ STAGES: dict[str, StageSpec] = {
         StageSpec("track", "slomo.track.stage", "track --sim", upstream=("optimize",), robot=True),
         StageSpec(
             "deploy", "slomo.deploy.stage", "deploy", upstream=("optimize", "track"), files=("deploy_log",), robot=True
+        ),
+        StageSpec(
+            "trials", "slomo.track.trials", "track --trials", upstream=("optimize",), robot=True, shares=ALL,
+            lender="track",
+        ),
+        StageSpec(
+            "replay", "slomo.report.replay", "track --replay", upstream=("optimize",), robot=True, shares=ALL,
+            lender="trials",
         ),
         StageSpec(
             "report", "slomo.report.stage", "report", robot=True, inspects=True, optional=("truth",),
@@ -234,8 +243,9 @@ class Project:
         table = self.tables.get(stage, {})
         record = STAGES[stage].of_module(STAGES[stage].config)
         if shares := STAGES[stage].shares:
-            names = [f.name for f in dataclasses.fields(record)] if shares == ALL else shares
-            table = {name: getattr(self.config("reconstruct"), name) for name in names} | table
+            lent = self.config(STAGES[stage].lender)
+            names = [f.name for f in dataclasses.fields(record) if hasattr(lent, f.name)] if shares == ALL else shares
+            table = {name: getattr(lent, name) for name in names} | table
         return settings.make(record, table, where=where)
 
     def files(self, stage: str) -> dict[str, Path]:

@@ -34,9 +34,9 @@ def _entries(module: str, name: str) -> list[tuple[str, Any, str]]:
     source = Path(spec.origin).read_text()
     body = ast.parse(source).body
     froms = {a.name: n.module for n in body if isinstance(n, ast.ImportFrom) for a in n.names}
-    record = next((n for n in body if isinstance(n, ast.ClassDef) and n.name == name), None)
-    if record is None:
-        return _entries(str(froms[name]), name)
+    if name in froms:
+        return _entries(froms[name] or module, name)
+    record = next(n for n in body if isinstance(n, ast.ClassDef) and n.name == name)
     named = {base.id for base in record.bases if isinstance(base, ast.Name)}
     inherited = [entry for base in named for entry in _entries(froms.get(base) or module, base)]
     fields = {

@@ -33,8 +33,10 @@ def _all_states(session: Session, robot: str | None) -> "dict[str, State]":
                 raise
             session.console.note(str(e))
             continue
-        lasts = ("report", "deploy") if own.given("deploy_log") else ("report",)
-        found |= {s.label: s for last in lasts for s in states(own, last).values()}
+        found |= {s.label: s for s in states(own, "report").values()}
+        for extra in ("trials", "replay", "deploy"):  # shown once they have been asked for
+            state = states(own, extra)[extra]
+            found |= {state.label: state} if state.status != "missing" else {}
     return found
 
 

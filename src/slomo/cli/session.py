@@ -152,6 +152,8 @@ class Session:
             report = json.loads((path / "report.json").read_text())
             if "checks" in report:
                 self.console.show(checks.as_table(report), f"optimize: {checks.as_line(report)}")
+        if m["stage"] == "trials" and "trials.json" in m["files"]:
+            self.console.note(json.loads((path / "trials.json").read_text())["text"])
         if m["failure"]:
             raise StageFailed(m["failure"], where=m["stage"], todo=f"its best result is in {path}")
 

@@ -47,6 +47,18 @@ PlanModelOption = Annotated[
 SolverOption = Annotated[
     str | None, typer.Option("--solver", metavar="ddp|fatrop|ipopt", help="How it is solved, see docs/solvers.md.")
 ]
+TrialsOption = Annotated[
+    int | None, typer.Option("--trials", metavar="N", help="Success rates of N random trials for each disturbance.")
+]
+CompareOption = Annotated[
+    bool, typer.Option("--compare", help="The same trials with convex MPC and with open-loop replay, in one table.")
+]
+RowsOption = Annotated[
+    str | None, typer.Option("--rows", metavar="ROW,ROW", help="Only these disturbances, see docs/trials.md.")
+]
+ReplayOption = Annotated[
+    str | None, typer.Option("--replay", metavar="ROW/N", help="One of the trials again, with its video.")
+]
 KEYPOINT_SUFFIXES = (".json", ".npz")
 BUILT_IN_SKELETONS = ("quadruped", "human")
 
@@ -117,6 +129,15 @@ def _from_clip(
     changes["camera"] = _given(fov_deg=fov)
     changes["reconstruct"] = changes.get("reconstruct", {}) | _given(length_m=length, quality=quality)
     return changes
+
+
+def _trials(trials: int | None, compare: bool, rows: str | None) -> dict[str, Any]:
+    """The options of `track --trials` and `--compare` as entries of slomo.toml."""
+    return {
+        "trials": trials if trials is not None else 10,
+        "controllers": ["ci-mpc", "convex-mpc", "open-loop"] if compare else None,
+        "rows": rows.split(",") if rows else None,
+    }
 
 
 def _truth(session: Session, truth: Path | None) -> dict[str, Any]:
@@ -244,16 +265,30 @@ def add_commands(app: typer.Typer) -> None:
         robot: RobotOption,
         sim: Annotated[bool, typer.Option("--sim", help="In simulation (MuJoCo).")] = False,
         no_video: Annotated[bool, typer.Option("--no-video", help="Leave out the report with its video.")] = False,
+        trials: TrialsOption = None,
+        compare: CompareOption = False,
+        rows: RowsOption = None,
+        replay: ReplayOption = None,
     ) -> None:
         """The robot follows the reference; then the report with the side-by-side video.
 
         \b
         slomo track --sim --robot go1
+        slomo track --robot go1 --trials 200
+        slomo track --robot go1 --compare
+        slomo track --robot go1 --replay push-18/7
         """
-        if not sim:
-            raise UsageError("where is the robot?", where="track", valid=("--sim",))
-        runner = session.runner(session.project(robot))
-        session.emit_artifact(runner.make_only("track", show=not no_video))
+        if replay is not None:
+            runner = session.runner(session.configure({"replay": {"trial": replay}}, robot))
+            session.emit_artifact(runner.make_only("replay"))
+        elif trials is not None or compare:
+            runner = session.runner(session.configure({"trials": _trials(trials, compare, rows)}, robot))
+            session.emit_artifact(runner.make_only("trials"))
+        elif sim:
+            runner = session.runner(session.project(robot))
+            session.emit_artifact(runner.make_only("track", show=not no_video))
+        else:
+            raise UsageError("what is to be done?", where="track", valid=("--sim", "--trials", "--compare", "--replay"))
 
     @command(app, "report", runs=True)
     def report(session: Session, robot: RobotOption, truth: TruthOption = None) -> None:

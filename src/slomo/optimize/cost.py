@@ -19,6 +19,7 @@ import numpy as np
 from slomo.optimize import constraints, so3
 from slomo.optimize.contact import tangents
 from slomo.optimize.jit import compiled
+from slomo.optimize.linear_body import NONLINEAR, LinearBody
 
 Array = np.ndarray
 
@@ -42,6 +43,7 @@ class Task(NamedTuple):
         slip_load: N, normal force from which slip counts half.
         cyclic: whether the end state must be the first one, turned about z and moved by `shift`.
         shift: (4,) m, m, m, rad: p_end = R_z(shift[3]) p_first + shift[:3].
+        linear: the body's dynamics about the reference, or `NONLINEAR`.
     """
 
     h: Array
@@ -60,6 +62,7 @@ class Task(NamedTuple):
     slip_load: float
     cyclic: bool
     shift: Array
+    linear: LinearBody = NONLINEAR
 
 
 @compiled

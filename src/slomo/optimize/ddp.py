@@ -13,8 +13,9 @@ import numpy as np
 from slomo.optimize.closing import end_cost, end_gap
 from slomo.optimize.cost import input_cost, state_cost
 from slomo.optimize.dense import copy
-from slomo.optimize.dynamics import minus, plus, step
+from slomo.optimize.dynamics import minus, plus
 from slomo.optimize.jit import compiled
+from slomo.optimize.linear_body import task_step
 from slomo.optimize.riccati import backward
 
 CONVERGED, ITERATIONS, STUCK, NOT_FINITE = 0, 1, 2, 3
@@ -38,8 +39,8 @@ def evaluate(body, task, kappa, it, rho, gap, w):
     N = it.us.shape[0]
     J = total = 0.0
     for k in range(N):
-        u, ground, h = it.us[k], task.ground[k + 1], length(body, task, it.us[k], k)
-        step(body, h, kappa, ground, task.stick[k], it.qs[k], it.vs[k], u, w.q1, w.v1, it.lam[k])
+        u = it.us[k]
+        task_step(body, task, kappa, k, length(body, task, u, k), it.qs[k], it.vs[k], u, w.q1, w.v1, it.lam[k])
         J += input_cost(body, task, k, it.vs[k], u, w.v1, it.lam[k], it.cone[k], rho)
         minus(w.q1, w.v1, it.qs[k + 1], it.vs[k + 1], gap[k])
         for i in range(gap.shape[1]):
@@ -176,8 +177,7 @@ def close(body, task, kappa, it, w):
             for j in range(d.shape[0]):
                 s += w.K[k, i, j] * d[j]
             it.us[k, i] = min(max(s, task.u_low[k, i]), task.u_high[k, i])
-        h, ground = length(body, task, it.us[k], k), task.ground[k + 1]
-        step(body, h, kappa, ground, task.stick[k], it.qs[k], it.vs[k], it.us[k], q, v, it.lam[k])
+        task_step(body, task, kappa, k, length(body, task, it.us[k], k), it.qs[k], it.vs[k], it.us[k], q, v, it.lam[k])
     for i in range(q.shape[0]):
         it.qs[N, i] = q[i]
     for i in range(v.shape[0]):

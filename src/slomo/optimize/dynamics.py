@@ -87,19 +87,15 @@ def _body_velocity(body, h, q, v, u, R, torque, v1):
 
 
 @compiled
-def _integrate(h, q, v1, q1):
+def _integrate_body(h, q, v1, q1):
     for i in range(3):
         q1[i] = q[i] + h * v1[i]
     so3.plus(q[3:7], h * v1[3], h * v1[4], h * v1[5], q1[3:7])
-    for i in range(7, q.shape[0]):
-        q1[i] = q[i] + h * v1[i - 1]
 
 
 @compiled
-def step(body, h, kappa, ground, stick, q, v, u, q1, v1, lam):
-    """The next state into q1, v1 and the contact forces into lam (C, 3). ground: (C, 4). stick: (C,). u: (3 C,) N."""
-    R, torque = np.empty((3, 3)), np.empty(3)
-    _body_velocity(body, h, q, v, u, R, torque, v1)
+def step_points(body, h, kappa, ground, stick, q, v, u, q1, v1, lam):
+    """The part of `step` below the body's: points and their contact forces."""
     for c in range(body.hips.shape[0]):
         i, j, m = 3 * c, 6 + 3 * c, body.foot_mass[c]
         f, vf, uf = q[7 + i : 10 + i], v[j : j + 3], u[i : i + 3]
@@ -107,16 +103,22 @@ def step(body, h, kappa, ground, stick, q, v, u, q1, v1, lam):
         for k in range(3):
             v1[j + k] = v[j + k] + h * (lam[c, k] - u[i + k]) / m
         v1[j + 2] -= h * body.g
-    _integrate(h, q, v1, q1)
+        for k in range(3):
+            q1[7 + i + k] = q[7 + i + k] + h * v1[j + k]
 
 
 @compiled
-def linearize(body, h, kappa, ground, stick, q, v, u, q1, v1, lam, A, B, D):
-    """`step` with A (nx, nx), B (nx, nu), its derivative, and D (C, 3, 10) of the contact forces.
+def step(body, h, kappa, ground, stick, q, v, u, q1, v1, lam):
+    """The next state into q1, v1 and the contact forces into lam (C, 3). ground: (C, 4). stick: (C,). u: (3 C,) N."""
+    R, torque = np.empty((3, 3)), np.empty(3)
+    _body_velocity(body, h, q, v, u, R, torque, v1)
+    _integrate_body(h, q, v1, q1)
+    step_points(body, h, kappa, ground, stick, q, v, u, q1, v1, lam)
 
-    A and B must come zeroed or from an earlier call: only entries that can differ from zero are written. With one more
-    column than forces, B's last one is the derivative with respect to h.
-    """
+
+@compiled
+def linearize_body(body, h, q, v, u, q1, v1, A, B):
+    """The body's part of `linearize`: its next state, and the first six rows of A and B of positions and velocities."""
     C = body.hips.shape[0]
     nv = 6 + 3 * C
     R, torque = np.empty((3, 3)), np.empty(3)
@@ -129,6 +131,9 @@ def linearize(body, h, kappa, ground, stick, q, v, u, q1, v1, lam, A, B, D):
         A[i, i] = 1.0
         A[nv + i, nv + i] = 1.0
         A[i, nv + i] = h
+        for c in range(C):
+            B[nv + i, 3 * c + i] = h / body.mass
+            B[i, 3 * c + i] = h * h / body.mass
 
     # Angular velocity: h I^-1 times the derivative of the torque in the body frame.
     W = np.empty((3, 3))  # h I^-1 R^T
@@ -168,8 +173,36 @@ def linearize(body, h, kappa, ground, stick, q, v, u, q1, v1, lam, A, B, D):
         A[r + i, r + 1] += d * L[0] - a * L[2]
         A[r + i, r + 2] += a * L[1] - b * L[0]
         A[r + i, r + i] += 1.0
+    _integrate_body(h, q, v1, q1)
 
-    # Points.
+    if B.shape[1] > 3 * C:
+        for i in range(6):
+            B[nv + i, 3 * C] = (v1[i] - v[i]) / h
+            B[i, 3 * C] = v1[i] + h * B[nv + i, 3 * C]
+
+    # Rotation: exp(h w1)^T d + h Jr(h w1) dw1.
+    hw, E, J = h * v1[3:6], np.empty((3, 3)), np.empty((3, 3))
+    so3.exp_matrix(hw, E)
+    so3.right_jacobian(hw, J)
+    for i in range(3):
+        for k in range(2 * nv):
+            A[3 + i, k] = h * (J[i, 0] * A[r, k] + J[i, 1] * A[r + 1, k] + J[i, 2] * A[r + 2, k])
+        for k in range(3 * C):
+            B[3 + i, k] = h * (J[i, 0] * B[r, k] + J[i, 1] * B[r + 1, k] + J[i, 2] * B[r + 2, k])
+        for k in range(3):
+            A[3 + i, 3 + k] += E[k, i]
+        if B.shape[1] > 3 * C:
+            k = 3 * C
+            B[3 + i, k] = 0.0
+            for n in range(3):
+                B[3 + i, k] += J[i, n] * (v1[3 + n] + h * B[r + n, k])
+
+
+@compiled
+def linearize_points(body, h, kappa, ground, stick, q, v, u, q1, v1, lam, A, B, D):
+    """The points' part of `linearize`."""
+    C = body.hips.shape[0]
+    nv = 6 + 3 * C
     for c in range(C):
         i, j, m = 3 * c, 6 + 3 * c, body.foot_mass[c]
         f, vf, uf = q[7 + i : 10 + i], v[j : j + 3], u[i : i + 3]
@@ -189,34 +222,24 @@ def linearize(body, h, kappa, ground, stick, q, v, u, q1, v1, lam, A, B, D):
                 A[j + k, nv + j + n] = h * A[row, nv + j + n]
                 B[j + k, i + n] = h * B[row, i + n]
             A[j + k, j + k] += 1.0
-            B[nv + k, i + k] = h / body.mass
-            B[k, i + k] = h * h / body.mass
         v1[j + 2] -= h * body.g
-    _integrate(h, q, v1, q1)
-
-    if B.shape[1] > 3 * C:
-        for i in range(nv):
-            B[nv + i, 3 * C] = (v1[i] - v[i]) / h
-            if i >= 6:
-                B[nv + i, 3 * C] += h / body.foot_mass[(i - 6) // 3] * D[(i - 6) // 3, i % 3, 9]
-            B[i, 3 * C] = v1[i] + h * B[nv + i, 3 * C]
-
-    # Rotation: exp(h w1)^T d + h Jr(h w1) dw1.
-    hw, E, J = h * v1[3:6], np.empty((3, 3)), np.empty((3, 3))
-    so3.exp_matrix(hw, E)
-    so3.right_jacobian(hw, J)
-    for i in range(3):
-        for k in range(2 * nv):
-            A[3 + i, k] = h * (J[i, 0] * A[r, k] + J[i, 1] * A[r + 1, k] + J[i, 2] * A[r + 2, k])
-        for k in range(3 * C):
-            B[3 + i, k] = h * (J[i, 0] * B[r, k] + J[i, 1] * B[r + 1, k] + J[i, 2] * B[r + 2, k])
         for k in range(3):
-            A[3 + i, 3 + k] += E[k, i]
-        if B.shape[1] > 3 * C:
-            k = 3 * C
-            B[3 + i, k] = 0.0
-            for n in range(3):
-                B[3 + i, k] += J[i, n] * (v1[3 + n] + h * B[r + n, k])
+            q1[7 + i + k] = q[7 + i + k] + h * v1[j + k]
+            if B.shape[1] > 3 * C:
+                row = nv + j + k
+                B[row, 3 * C] = (v1[j + k] - v[j + k]) / h + h / m * D[c, k, 9]
+                B[j + k, 3 * C] = v1[j + k] + h * B[row, 3 * C]
+
+
+@compiled
+def linearize(body, h, kappa, ground, stick, q, v, u, q1, v1, lam, A, B, D):
+    """`step` with A (nx, nx), B (nx, nu), its derivative, and D (C, 3, 10) of the contact forces.
+
+    A and B must come zeroed or from an earlier call: only entries that can differ from zero are written. With one more
+    column than forces, B's last one is the derivative with respect to h.
+    """
+    linearize_body(body, h, q, v, u, q1, v1, A, B)
+    linearize_points(body, h, kappa, ground, stick, q, v, u, q1, v1, lam, A, B, D)
 
 
 @compiled

@@ -20,7 +20,7 @@ def _cache_folder() -> str:
     digest = hashlib.sha256()
     here = Path(__file__).parent
     track = here.parent / "track"
-    for path in (*sorted(here.glob("*.py")), track / "mpc.py", track / "inekf.py"):
+    for path in (*sorted(here.glob("*.py")), track / "plan.py", track / "inekf.py"):
         digest.update(path.read_bytes())
     try:
         base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")

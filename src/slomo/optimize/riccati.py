@@ -15,8 +15,8 @@ from slomo.optimize.dense import (
     symmetric_times,
     transpose_times,
 )
-from slomo.optimize.dynamics import linearize
 from slomo.optimize.jit import compiled
+from slomo.optimize.linear_body import task_linearize
 
 # Proximal weights of the Levenberg-Marquardt term: positions, velocities, inputs (1/m^2, s^2/m^2, 1/N^2), step length.
 _PROX_Q, _PROX_V, _PROX_U, _PROX_H = 1.0, 1e-2, 1e-4, 1e2
@@ -58,9 +58,9 @@ def backward(body, task, kappa, it, rho, reg, free_start, w):
                     w.Lt[i] = Vt[i]
         else:
             A, B, Lu = w.A[k], w.B[k], w.Lu[k]
-            q, v, u, ground = it.qs[k], it.vs[k], it.us[k], task.ground[k + 1]
+            q, v, u = it.qs[k], it.vs[k], it.us[k]
             h = u[nf] if nu > nf else task.h[k]
-            linearize(body, h, kappa, ground, task.stick[k], q, v, u, w.q1, w.v1, it.lam[k], A, B, w.D)
+            task_linearize(body, task, kappa, k, h, q, v, u, w.q1, w.v1, it.lam[k], A, B, w.D)
             for i in range(nx):
                 for j in range(nx):
                     Vx[i] += Vxx[i, j] * w.gap[k, j]

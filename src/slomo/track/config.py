@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 
 from slomo.errors import UsageError
-from slomo.track.mpc import MpcConfig
+from slomo.track.mpc import MODELS, MpcConfig
+from slomo.track.planner import PLANNERS
 
 JOINT_HZ = 500
 STATES = ("estimated", "truth")
@@ -14,6 +15,8 @@ class Config(MpcConfig):
     """Parameters of the controller and of its test in simulation; those of the MPC are those of `mpc.MpcConfig`.
 
     Attributes:
+        controller: "ci-mpc"; for comparison "convex-mpc" (contact schedule of the reference, see `convex_mpc`) or
+            "open-loop" (see `open_loop`).
         state: what the controller knows: "estimated" from joint encoders and IMU, or "truth", for study.
         joint_layer: from plan to joints: "ik" (inverse kinematics, PD and J^T forces).
         mpc_hz: 1/s, a divisor of 500.
@@ -26,6 +29,7 @@ class Config(MpcConfig):
         blend: s, gathering the first pose's velocity.
     """
 
+    controller: str = "ci-mpc"
     state: str = "estimated"
     joint_layer: str = "ik"
     mpc_hz: int = 100
@@ -42,7 +46,8 @@ def check(config: Config) -> None:
     """Raises `UsageError` for a parameter out of range."""
     if config.mpc_hz <= 0 or JOINT_HZ % config.mpc_hz:
         raise UsageError(f"{config.mpc_hz} does not divide {JOINT_HZ}", where="track.mpc_hz", valid=(50, 100, 125, 250))
-    for name, valid in (("state", STATES), ("joint_layer", ("ik",))):
+    choices = (("controller", tuple(PLANNERS)), ("mpc_model", MODELS), ("state", STATES), ("joint_layer", ("ik",)))
+    for name, valid in choices:
         if getattr(config, name) not in valid:
             raise UsageError(f"{getattr(config, name)!r}", where=f"track.{name}", valid=valid)
     for name in ("horizon", "dt", "iterations", "mu", "kappa", "kp", "friction", "blend"):

@@ -1,7 +1,5 @@
 """From a robot's sensors to its motors: state, plan, joint targets. Knows no simulation and no network."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from slomo.motion import Reference
@@ -12,7 +10,9 @@ from slomo.track.config import Config
 from slomo.track.estimator import Estimator
 from slomo.track.joint_space import JointCommand, JointSpace
 from slomo.track.lead_in import with_lead_in
-from slomo.track.mpc import Mpc, Plan
+from slomo.track.open_loop import STIFFER
+from slomo.track.plan import Plan
+from slomo.track.planner import make_planner
 from slomo.track.sensors import SensorSample
 
 Array = np.ndarray
@@ -27,7 +27,6 @@ class Controller:
         robot: whose reference it is.
         reference: starts at t = 0; the lead-in from a stand is put before it here.
         terrain: ground as it was planned.
-        planner: makes the planner, `mpc.Mpc` or anything with its methods.
 
     Attributes:
         reference: with the lead-in; it begins at reference.t[0] < 0, on the controller's clock.
@@ -42,13 +41,13 @@ class Controller:
         *,
         terrain: Terrain,
         config: Config,
-        planner: Callable[..., Mpc] = Mpc,
     ):
         model = PointFootModel.from_robot(robot, mu=config.mu)
         self.robot, self.config, self.terrain = robot, config, terrain
         self.reference = with_lead_in(reference, model, terrain=terrain, settle=config.settle, blend=config.blend)
-        self.planner = planner(model, self.reference, terrain=terrain, config=config)
-        self.joints = JointSpace(robot, kp=config.kp, kd=config.kd)
+        self.planner = make_planner(config.controller, model, self.reference, terrain=terrain, config=config)
+        kp, kd = STIFFER if config.controller == "open-loop" else (1.0, 1.0)
+        self.joints = JointSpace(robot, kp=kp * config.kp, kd=kd * config.kd)
         self.estimator = Estimator(robot, terrain)
         self.plan: Plan | None = None
         self._begin()

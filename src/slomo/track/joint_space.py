@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
 from slomo.robot import Robot
-from slomo.track.mpc import PlanPoint
+from slomo.track.plan import PlanPoint
 
 Array = np.ndarray
 

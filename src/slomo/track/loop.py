@@ -1,6 +1,5 @@
 """The controller and the simulated robot, each at its rate."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +13,7 @@ from slomo.track.config import JOINT_HZ, Config
 from slomo.track.controller import Controller
 from slomo.track.disturbance import Disturbance
 from slomo.track.joint_space import JointSpace
-from slomo.track.mpc import Mpc, PlanPoint
+from slomo.track.plan import PlanPoint
 from slomo.track.recording import Recording, reference_at
 from slomo.track.sensors import SensorSample, SimulatedSensors
 from slomo.track.simulation import Simulation
@@ -46,7 +45,6 @@ def simulate(
     disturbance: Disturbance,
     progress: Progress,
     world: Terrain | None = None,
-    planner: Callable[..., Mpc] = Mpc,
     reference_digest: str = "",
 ) -> Outcome:
     """Follow the reference in MuJoCo from the lead-in's first time to the end, or until the robot falls.
@@ -58,9 +56,8 @@ def simulate(
     Args:
         reference: without a lead-in.
         terrain: as it was planned; `world`: as it is, by default the same. The disturbance comes on top.
-        planner: see `Controller`.
     """
-    controller = Controller(robot, reference, terrain=terrain, config=config, planner=planner)
+    controller = Controller(robot, reference, terrain=terrain, config=config)
     ground = disturbance.ground(world or terrain)
     simulation = Simulation(
         robot,

@@ -9,20 +9,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slomo.errors import UsageError
 from slomo.motion import Reference
-from slomo.optimize import constraints, ddp, so3
+from slomo.optimize import constraints, ddp
 from slomo.optimize.cost import Task
-from slomo.optimize.dynamics import Body, minus
+from slomo.optimize.dynamics import Body
 from slomo.optimize.iterate import Iterate, Work
-from slomo.optimize.jit import compiled
+from slomo.optimize.linear_body import NONLINEAR, LinearBody, linearize_reference
 from slomo.pointfoot import PointFootModel
 from slomo.terrain import Terrain
+from slomo.track.plan import Plan, sample_all
 
 Array = np.ndarray
 
 _REG = 1e-6  # first Levenberg-Marquardt factor of every tick: one grown in an earlier tick would freeze the plan
 _DEFECT = 1.0  # l1 norm of the gaps under which an iterate that finds no further descent is a plan
 _PENALTY = 1e4  # 1/m^2
+MODELS = ("ncp", "lcp")
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,8 @@ class MpcConfig:
     """Parameters of the controller; weights as in `optimize.problem.Weights`.
 
     Attributes:
+        mpc_model: what it plans with. "ncp": the nonlinear dynamics (a nonlinear complementarity problem). "lcp": the
+            body linearised about the reference, only contact left as it is (see `optimize.linear_body`).
         horizon: number of steps.  dt: s, their length.
         iterations: most Newton steps a tick.  tolerance: relative decrease of the cost that ends them.
         mu: friction coefficient to plan with.  kappa: N m, smoothing of the contact.
@@ -37,6 +42,7 @@ class MpcConfig:
         terminal: s, weight of the end state (as if it lasted that long).
     """
 
+    mpc_model: str = "ncp"
     horizon: int = 10
     dt: float = 0.025
     iterations: int = 4
@@ -57,115 +63,6 @@ class MpcConfig:
     terminal: float = 0.1
 
 
-@compiled
-def _sample(knots, qs, vs, us, t, q, v, u):
-    """State at time t between knots (N + 1,), by linear interpolation (rotations along the geodesic), and the velocity
-    and input of the step that t is in, as the integrator has them. Outside of the knots it stands still."""
-    N = us.shape[0]
-    k, after = 0, N + 1  # the last knot that is not later, by bisection: references may be minutes long
-    while after - k > 1:
-        middle = (k + after) // 2
-        if t >= knots[middle] - 1e-9:
-            k = middle
-        else:
-            after = middle
-    moving = 1.0 if k < N and t >= knots[0] - 1e-9 else 0.0
-    n = min(k + 1, N)
-    a = moving * max(t - knots[k], 0.0) / (knots[n] - knots[k]) if n > k else 0.0
-    w = np.empty(3)
-    so3.minus(qs[n, 3:7], qs[k, 3:7], w)
-    so3.plus(qs[k, 3:7], a * w[0], a * w[1], a * w[2], q[3:7])
-    for i in range(qs.shape[1]):
-        if i < 3 or i >= 7:
-            q[i] = (1 - a) * qs[k, i] + a * qs[n, i]
-    for i in range(v.shape[0]):
-        v[i] = moving * vs[n, i]
-    for i in range(u.shape[0]):
-        u[i] = us[min(k, N - 1), i]
-
-
-@compiled
-def _sample_all(knots, qs, vs, us, t, q_out, v_out, u_out):
-    """`_sample` at times t (M + 1,): states at them, velocities and inputs in the middle of the step before."""
-    u, v = np.empty(us.shape[1]), np.empty(vs.shape[1])
-    for k in range(t.shape[0]):
-        before = 0.5 * (t[k] + t[k - 1]) if k > 0 else t[0] - 0.5 * (t[1] - t[0])
-        _sample(knots, qs, vs, us, before, q_out[k], v_out[k], u_out[k - 1] if k > 0 else u)
-        _sample(knots, qs, vs, us, t[k], q_out[k], v, u)
-
-
-@dataclass(frozen=True)
-class PlanPoint:
-    """The plan at one time, world frame.
-
-    Attributes:
-        position: (3,) m.  quat_xyzw: (4,).  velocity: (3,) m/s.  angular_velocity: (3,) rad/s, body frame.
-        points, point_velocities: (C, 3) m, m/s.  u: (C, 3) N, of each point on the body.  lam: (C, 3) N, of the ground.
-    """
-
-    position: Array
-    quat_xyzw: Array
-    velocity: Array
-    angular_velocity: Array
-    points: Array
-    point_velocities: Array
-    u: Array
-    lam: Array
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What the controller intends from time `t` on.
-
-    Attributes:
-        t: (H + 1,) s, its knots; the first is when the state was measured.
-        q (H + 1, 7 + 3 C), v (H + 1, 6 + 3 C), u (H, 3 C), lam (H, C, 3): as in `motion.Reference`.
-        gains: (H, 3 C, 12 + 6 C), Riccati feedback of u on the tangent-space deviation from q, v.
-        status: 0 solved, 1 the solver failed and the previous plan goes on.
-        defect: l1 norm of what the dynamics lack over the horizon.
-        seconds: wall time of the solve.
-    """
-
-    t: Array
-    q: Array
-    v: Array
-    u: Array
-    lam: Array
-    gains: Array
-    u_max: Array
-    status: int
-    defect: float
-    seconds: float
-
-    def at(self, t: float) -> PlanPoint:
-        """The plan at time t (s), between its knots; before or after them it stands still."""
-        q, v, u = np.empty(self.q.shape[1]), np.empty(self.v.shape[1]), np.empty(self.u.shape[1])
-        _sample(self.t, self.q, self.v, self.u, t, q, v, u)
-        return PlanPoint(
-            position=q[:3],
-            quat_xyzw=q[3:7],
-            velocity=v[:3],
-            angular_velocity=v[3:6],
-            points=q[7:].reshape(-1, 3),
-            point_velocities=v[6:].reshape(-1, 3),
-            u=u.reshape(-1, 3),
-            lam=self.lam[self._step(t)],
-        )
-
-    def feedback(self, t: float, q: Array, v: Array) -> Array:
-        """(C, 3) N: the forces for the state that is there at time t, by the Riccati gains, within the limits."""
-        qp, vp, u = np.empty(self.q.shape[1]), np.empty(self.v.shape[1]), np.empty(self.u.shape[1])
-        _sample(self.t, self.q, self.v, self.u, t, qp, vp, u)
-        k = self._step(t)
-        a = min(max((t - self.t[k]) / (self.t[k + 1] - self.t[k]), 0.0), 1.0)
-        d = np.empty(2 * len(v))
-        minus(q, v, qp, (1 - a) * self.v[k] + a * self.v[k + 1], d)
-        return np.clip(u + self.gains[k] @ d, -self.u_max, self.u_max).reshape(-1, 3)
-
-    def _step(self, t: float) -> int:
-        return min(max(int(np.searchsorted(self.t, t + 1e-9)) - 1, 0), len(self.u) - 1)
-
-
 class Mpc:
     """Tracks a reference with the point-foot model.
 
@@ -179,6 +76,8 @@ class Mpc:
         self, model: PointFootModel, reference: Reference, *, terrain: Terrain, config: MpcConfig | None = None
     ):
         self.config = c = config or MpcConfig()
+        if c.mpc_model not in MODELS:
+            raise UsageError(f"no model {c.mpc_model!r}", where="track.mpc_model", valid=MODELS)
         self.model = replace(model, mu=c.mu)
         self.terrain = terrain
         self.reference = reference
@@ -196,7 +95,7 @@ class Mpc:
             u_ref=np.zeros((H, 3 * C)), w_x=w, w_u=np.full((H, 3 * C), c.effort),
             u_low=np.tile(-model.u_max.ravel(), (H, 1)), u_high=np.tile(model.u_max.ravel(), (H, 1)),
             w_acceleration=c.acceleration, w_spin=0.0, w_slip=c.slip, slip_load=c.slip_load, cyclic=False,
-            shift=np.zeros(4),
+            shift=np.zeros(4), linear=NONLINEAR if c.mpc_model == "ncp" else LinearBody.zeros(H, C),
         )  # fmt: skip
         self._work = Work.make(self._new_iterate())
         r = reference
@@ -204,6 +103,7 @@ class Mpc:
             np.ascontiguousarray(x, float) for x in (r.t, r.q, r.v, r.u)
         )
         self._hold = self._standing_forces()
+        self._along = self._linearized() if c.mpc_model == "lcp" else NONLINEAR
         self._plan: Plan | None = None
 
     def _standing_forces(self) -> Array:
@@ -213,6 +113,30 @@ class Mpc:
         u = np.zeros((self.model.C, 3))
         u[:, 2] = self.model.mass * self.model.g * near / near.sum()
         return u.ravel()
+
+    def _sample_reference(self, knots: Array, q: Array, v: Array, u: Array) -> None:
+        """The reference at knots (M + 1,), as `plan.sample_all` has it; after its end it stands."""
+        sample_all(self._t_ref, self._q_ref, self._v_ref, self._u_ref, knots, q, v, u)
+        u[knots[1:] > self.reference.t[-1] + 1e-9] = self._hold
+
+    def _linearized(self) -> LinearBody:
+        """Matrices along the whole reference in steps of dt, and one step more, in which it stands."""
+        dt, origin = self.config.dt, self.reference.t[0]
+        M = int(np.ceil((self.reference.t[-1] - origin) / dt - 1e-9)) + 1
+        along = LinearBody.zeros(M, self.model.C)
+        self._sample_reference(origin + dt * np.arange(M + 1), along.q, along.v, along.u)
+        linearize_reference(self._body, np.full(M, dt), along, 0, M)
+        return along
+
+    def _linearize(self, first: int) -> None:
+        """The task's matrices, where `first` is its first knot's place in the grid: those made beforehand, and those of
+        the first step, which is shorter."""
+        task, linear, along = self._task, self._task.linear, self._along
+        steps = np.minimum(first + np.arange(len(linear.c)), len(along.c) - 1)
+        for name in ("A", "B", "c"):
+            np.take(getattr(along, name), steps, axis=0, out=getattr(linear, name))
+        linear.q[:], linear.v[:], linear.u[:] = task.q_ref, task.v_ref, task.u_ref
+        linearize_reference(self._body, task.h, linear, 0, 1)
 
     def _new_iterate(self) -> Iterate:
         task = self._task
@@ -246,21 +170,25 @@ class Mpc:
         # contact planned at a knot comes nearer, instead of being put off by a little at every tick. The last fifth of
         # a step joins the next one, because the model is stiff in very short steps.
         origin = float(self.reference.t[0])
-        knots = origin + c.dt * (np.floor((t - origin) / c.dt + 0.2) + np.arange(H + 1))
+        first = int(np.floor((t - origin) / c.dt + 0.2))
+        knots = origin + c.dt * (first + np.arange(H + 1))
         knots[0] = t
         task.h[0] = knots[1] - t
-        _sample_all(self._t_ref, self._q_ref, self._v_ref, self._u_ref, knots, task.q_ref, task.v_ref, task.u_ref)
+        self._sample_reference(knots, task.q_ref, task.v_ref, task.u_ref)
+        if c.mpc_model == "lcp":
+            self._linearize(first)
         task.q_ref[:, 9::3] += shift
-        task.u_ref[knots[1:] > self.reference.t[-1] + 1e-9] = self._hold
         last = self._plan
         it = self._new_iterate()
         if last is not None:
             # The last plan as far as it reaches; what follows stays at the reference.
             n = int(np.searchsorted(knots, last.t[-1] + 1e-9)) - 1
             if n > 0:
-                _sample_all(last.t, last.q, last.v, last.u, knots[: n + 1], it.qs[: n + 1], it.vs[: n + 1], it.us[:n])
+                sample_all(last.t, last.q, last.v, last.u, knots[: n + 1], it.qs[: n + 1], it.vs[: n + 1], it.us[:n])
         it.qs[0], it.vs[0] = q, v
-        task.ground[:] = self.terrain.planes(it.qs[:, 7:].reshape(H + 1, C, 3))
+        # The LCP's gaps are about the reference, as all else in it.
+        under = it.qs if c.mpc_model == "ncp" else task.q_ref
+        task.ground[:] = self.terrain.planes(under[:, 7:].reshape(H + 1, C, 3))
         task.ground[:, :, 3] += shift * task.ground[:, :, 2]
         status, _, _, defect, _ = ddp.solve(
             self._body, task, c.kappa, it, _PENALTY, False, c.iterations, c.tolerance, 1e-7, _REG, self._work

@@ -34,7 +34,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     upstream = inputs.artifacts["optimize"]
     reference = Reference.from_arrays(upstream.npz["reference.npz"])
     terrain = Terrain.from_json(upstream.json["terrain.json"])
-    _check_robot(reference, robot)
+    check_robot(reference, robot)
     for note in robot.notes:
         progress.note(f"{robot.name}: {note}")
 
@@ -46,7 +46,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
         config=config,
         disturbance=Disturbance(),
         progress=progress,
-        reference_digest=_digest(upstream.npz["reference.npz"]),
+        reference_digest=reference_digest(upstream.npz["reference.npz"]),
     )
     rollout = outcome.rollout
     report = {
@@ -69,7 +69,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     )
 
 
-def _digest(arrays: Arrays) -> str:
+def reference_digest(arrays: Arrays) -> str:
     """SHA-256 of arrays by name, dtype, shape and bytes."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
@@ -78,7 +78,8 @@ def _digest(arrays: Arrays) -> str:
     return digest.hexdigest()
 
 
-def _check_robot(reference: Reference, robot: Robot) -> None:
+def check_robot(reference: Reference, robot: Robot) -> None:
+    """Raises `MissingInput` where the reference is not the robot's."""
     if reference.robot_digest != robot.digest or reference.point_names != robot.foot_names:
         raise MissingInput(
             f"the reference was made for another robot (or another version of it) than {robot.name}",
