@@ -90,7 +90,9 @@ def artifacts(robot, truth):
             npz={"reference.npz": reference.to_arrays()},
             json={"report.json": {"verified": True, "penetration": 2e-4, "limits": limits}, "terrain.json": terrain},
         ),
-        "track": Artifact(npz={"rollout.npz": rollout.to_arrays()}, json={"metrics.json": {"fell": False}}),
+        "track": Artifact(
+            npz={"rollout.npz": rollout.to_arrays()}, json={"metrics.json": {"fell": False}, "terrain.json": {}}
+        ),
     }
 
 

@@ -147,7 +147,7 @@ def test_lead_in_stands_and_arrives():
     v[0, 9:12] = [0.8, 0.0, 0.2]
     v[0, :6] = [0.3, 0.1, 0.05, 0.2, -0.1, 0.4]
     reference = dataclasses.replace(reference, q=q, v=v)
-    whole = with_lead_in(reference, model, terrain=terrain, settle=0.3, blend=0.6)
+    whole = with_lead_in(reference, model, standing=robot.nominal_feet, terrain=terrain, settle=0.3, blend=0.6)
     n = int(np.sum(whole.t < 0))
     np.testing.assert_array_equal(whole.q[n:], reference.q)
     assert whole.t[0] == pytest.approx(-0.9, abs=H)
@@ -174,7 +174,14 @@ def test_lead_in_of_a_motion_that_begins_in_flight():
     q = reference.q.copy()
     q[:, [2, 9, 12, 15, 18]] += 0.05
     model = PointFootModel.from_robot(robot)
-    whole = with_lead_in(dataclasses.replace(reference, q=q), model, terrain=Terrain(), settle=0.3, blend=0.6)
+    whole = with_lead_in(
+        dataclasses.replace(reference, q=q),
+        model,
+        standing=robot.nominal_feet,
+        terrain=Terrain(),
+        settle=0.3,
+        blend=0.6,
+    )
     np.testing.assert_allclose(whole.points[0, :, 2], 0, atol=1e-12)
     assert np.all(whole.u[whole.t[:-1] == -H] == 0)
 

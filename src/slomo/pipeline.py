@@ -101,7 +101,9 @@ STAGES: dict[str, StageSpec] = {
             "retarget", "slomo.retarget.stage", "retarget", upstream=("reconstruct",), optional=("terrain",), robot=True
         ),
         StageSpec("optimize", "slomo.optimize.stage", "optimize", upstream=("retarget",), robot=True),
-        StageSpec("track", "slomo.track.stage", "track --sim", upstream=("optimize",), robot=True),
+        StageSpec(
+            "track", "slomo.track.stage", "track --sim", upstream=("optimize",), optional=("world",), robot=True
+        ),
         StageSpec(
             "deploy", "slomo.deploy.stage", "deploy", upstream=("optimize", "track"), files=("deploy_log",), robot=True
         ),

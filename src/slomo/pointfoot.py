@@ -103,6 +103,11 @@ class PointFootModel:
         return len(self.names)
 
     @property
+    def is_hand(self) -> Array:
+        """(C,) bool: points that do not stand on the ground."""
+        return np.array([name.endswith("_hand") for name in self.names])
+
+    @property
     def key_points(self) -> tuple[str, ...]:
         """Names of the points in key-point motions (see `robot.key_point_names`)."""
         return key_point_names(self.names)

@@ -4,7 +4,7 @@ import sys
 
 import typer
 
-from slomo.cli import deploy, export, project, stages, tools
+from slomo.cli import deploy, export, project, stages, tools, track
 
 app = typer.Typer(
     name="slomo",
@@ -18,6 +18,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 stages.add_commands(app)
+track.add_commands(app)
 project.add_commands(app)
 deploy.add_commands(app)
 export.add_commands(app)

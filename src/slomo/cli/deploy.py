@@ -110,7 +110,7 @@ def add_commands(app: typer.Typer) -> None:
         model = load_robot(robot)
         config = TwinConfig(noise=noise, friction=friction, battery=battery, temperature=temperature, seed=seed)
         simulated = Twin(
-            model, plan.terrain if plan else Terrain(), lying(plan, model), config=config, scrambled=scrambled
+            model, plan.world if plan else Terrain(), lying(plan, model), config=config, scrambled=scrambled
         )
         end = time.monotonic() + seconds if seconds is not None else float("inf")
         serve(
@@ -134,10 +134,12 @@ def _plan(session: Session, robot: str, *, wanted_by: str):
     runner = session.runner(project)
     runner.current("track", wanted_by=wanted_by)
     optimized = runner.current("optimize", wanted_by=wanted_by)
+    terrain = Terrain.from_json(optimized.json["terrain.json"])
     return Plan(
         robot=robot,
         reference=Reference.from_arrays(optimized.npz["reference.npz"]),
-        terrain=Terrain.from_json(optimized.json["terrain.json"]),
+        terrain=terrain,
+        world=Terrain.load(world) if (world := project.given("world")) else terrain,
         track=project.config("track"),
         deploy=config,
         identity=identity(optimized.npz["reference.npz"], project.robot, config),

@@ -1,4 +1,4 @@
-"""The commands that make artifacts."""
+"""The commands that make artifacts, from the clip to the reference, the report, and all at once."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -46,18 +46,6 @@ PlanModelOption = Annotated[
 ]
 SolverOption = Annotated[
     str | None, typer.Option("--solver", metavar="ddp|fatrop|ipopt", help="How it is solved, see docs/solvers.md.")
-]
-TrialsOption = Annotated[
-    int | None, typer.Option("--trials", metavar="N", help="Success rates of N random trials for each disturbance.")
-]
-CompareOption = Annotated[
-    bool, typer.Option("--compare", help="The same trials with convex MPC and with open-loop replay, in one table.")
-]
-RowsOption = Annotated[
-    str | None, typer.Option("--rows", metavar="ROW,ROW", help="Only these disturbances, see docs/trials.md.")
-]
-ReplayOption = Annotated[
-    str | None, typer.Option("--replay", metavar="ROW/N", help="One of the trials again, with its video.")
 ]
 KEYPOINT_SUFFIXES = (".json", ".npz")
 BUILT_IN_SKELETONS = ("quadruped", "human")
@@ -129,15 +117,6 @@ def _from_clip(
     changes["camera"] = _given(fov_deg=fov)
     changes["reconstruct"] = changes.get("reconstruct", {}) | _given(length_m=length, quality=quality)
     return changes
-
-
-def _trials(trials: int | None, compare: bool, rows: str | None) -> dict[str, Any]:
-    """The options of `track --trials` and `--compare` as entries of slomo.toml."""
-    return {
-        "trials": trials if trials is not None else 10,
-        "controllers": ["ci-mpc", "convex-mpc", "open-loop"] if compare else None,
-        "rows": rows.split(",") if rows else None,
-    }
 
 
 def _truth(session: Session, truth: Path | None) -> dict[str, Any]:
@@ -258,37 +237,6 @@ def add_commands(app: typer.Typer) -> None:
             changes |= {"shortest_step": 0.7 if free_steps else None, "longest_step": 1.4 if free_steps else None}
         project = session.configure({"optimize": changes}, robot)
         session.emit_artifact(session.runner(project).make_only("optimize"))
-
-    @command(app, "track", runs=True)
-    def track(
-        session: Session,
-        robot: RobotOption,
-        sim: Annotated[bool, typer.Option("--sim", help="In simulation (MuJoCo).")] = False,
-        no_video: Annotated[bool, typer.Option("--no-video", help="Leave out the report with its video.")] = False,
-        trials: TrialsOption = None,
-        compare: CompareOption = False,
-        rows: RowsOption = None,
-        replay: ReplayOption = None,
-    ) -> None:
-        """The robot follows the reference; then the report with the side-by-side video.
-
-        \b
-        slomo track --sim --robot go1
-        slomo track --robot go1 --trials 200
-        slomo track --robot go1 --compare
-        slomo track --robot go1 --replay push-18/7
-        """
-        if replay is not None:
-            runner = session.runner(session.configure({"replay": {"trial": replay}}, robot))
-            session.emit_artifact(runner.make_only("replay"))
-        elif trials is not None or compare:
-            runner = session.runner(session.configure({"trials": _trials(trials, compare, rows)}, robot))
-            session.emit_artifact(runner.make_only("trials"))
-        elif sim:
-            runner = session.runner(session.project(robot))
-            session.emit_artifact(runner.make_only("track", show=not no_video))
-        else:
-            raise UsageError("what is to be done?", where="track", valid=("--sim", "--trials", "--compare", "--replay"))
 
     @command(app, "report", runs=True)
     def report(session: Session, robot: RobotOption, truth: TruthOption = None) -> None:

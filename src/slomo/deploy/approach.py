@@ -15,14 +15,20 @@ from slomo.motion import Reference
 from slomo.pointfoot import PointFootModel
 from slomo.robot import Robot
 from slomo.terrain import Terrain
-from slomo.track.config import Config as TrackConfig
+from slomo.track.cyclic import repeated
 from slomo.track.lead_in import balance, with_lead_in
+from slomo.track.stage import Config as TrackConfig
 
 Array = np.ndarray
 
 SHIFT, SWING, LIFT = 0.4, 0.4, 0.05  # s, s, m: of a step
 STAY = 2e-3  # m, by which a foot may be elsewhere without a step
 ORDER = (2, 0, 3, 1)  # limbs: hind left, front left, hind right, front right
+
+
+def motion_of(reference: Reference, track: TrackConfig) -> Reference:
+    """What is performed of a reference: all of it, or its cycle repeated for as long as `track` says."""
+    return repeated(reference, track.seconds) if track.seconds else reference
 
 
 @dataclass(frozen=True)
@@ -43,7 +49,10 @@ def with_approach(
     last pose, with the feet that are in the air set down, then the crawl back.
     """
     model = PointFootModel.from_robot(robot, mu=track.mu)
-    led = with_lead_in(reference, model, terrain=terrain, settle=track.settle, blend=track.blend)
+    led = with_lead_in(
+        motion_of(reference, track), model, standing=robot.nominal_feet, terrain=terrain, settle=track.settle,
+        blend=track.blend,
+    )  # fmt: skip
     first, last = _pose(led, 0), _pose(led, -1)
     down = last.feet.copy()
     down[:, 2] = terrain.height(down)

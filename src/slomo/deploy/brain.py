@@ -20,9 +20,9 @@ from slomo.deploy.approach import with_approach
 from slomo.errors import SlomoError
 from slomo.motion import Reference
 from slomo.terrain import Terrain
-from slomo.track.config import Config
 from slomo.track.joint_space import JointCommand
 from slomo.track.sensors import SensorSample
+from slomo.track.stage import Config
 
 Array = np.ndarray
 

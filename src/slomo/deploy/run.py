@@ -29,8 +29,8 @@ from slomo.motion import Reference
 from slomo.robot import Robot, load_robot
 from slomo.store import plain
 from slomo.terrain import Terrain
-from slomo.track.config import Config as TrackConfig
 from slomo.track.joint_space import JointSpace
+from slomo.track.stage import Config as TrackConfig
 
 Array = np.ndarray
 
@@ -44,7 +44,7 @@ class Plan:
 
     Attributes:
         robot: name or path.
-        reference, terrain: of `optimize`.
+        reference, terrain: of `optimize`.  world: the ground of a twin of its own.
         track, deploy: parameters.
         identity: what `stage.identity` says of all this.
     """
@@ -52,6 +52,7 @@ class Plan:
     robot: str
     reference: Reference
     terrain: Terrain
+    world: Terrain
     track: TrackConfig
     deploy: Config
     identity: dict[str, Any]
@@ -137,7 +138,7 @@ def _reach(
     plan: Plan, way: Way, robot: Robot, stack: contextlib.ExitStack, say: Callable[[str], None], *, virtual: bool
 ) -> tuple[Link, Clock]:
     if virtual:
-        twin = Twin(robot, plan.terrain, lying(plan, robot), config=TwinConfig(), scrambled=way.scrambled)
+        twin = Twin(robot, plan.world, lying(plan, robot), config=TwinConfig(), scrambled=way.scrambled)
         link = VirtualLink(twin)
         say("dry run: on a twin in virtual time, nothing is sent")
         return link, link
@@ -185,7 +186,7 @@ def _twin(plan: Plan, way: Way, ready: Any, parent: int) -> None:
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     robot = load_robot(plan.robot)
-    twin = Twin(robot, plan.terrain, lying(plan, robot), config=TwinConfig(), scrambled=way.scrambled)
+    twin = Twin(robot, plan.world, lying(plan, robot), config=TwinConfig(), scrambled=way.scrambled)
     with _priority(way.realtime):
         serve(twin, LOOPBACK, way.port, until=lambda: os.getppid() != parent, say=lambda text: ready.set())
 

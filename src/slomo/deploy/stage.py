@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
-from slomo.deploy.approach import with_approach
+from slomo.deploy.approach import motion_of, with_approach
 from slomo.deploy.config import HZ, Config
 from slomo.deploy.log import read
 from slomo.deploy.mcap_file import to_mcap
@@ -19,9 +19,9 @@ from slomo.store import plain
 from slomo.store.digest import digest_arrays
 from slomo.terrain import Terrain
 from slomo.track import metrics
-from slomo.track.config import Config as TrackConfig
 from slomo.track.joint_space import JointSpace
 from slomo.track.recording import reference_at
+from slomo.track.stage import Config as TrackConfig
 
 Array = np.ndarray
 
@@ -54,7 +54,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     digest = str(inputs.artifacts["track"].npz["rollout.npz"]["reference_digest"])
     track = TrackConfig(**header["track"])
     terrain = Terrain.from_json(upstream.json["terrain.json"])
-    end = float(reference.t[-1])
+    end = float(motion_of(reference, track).t[-1])
     reference = with_approach(reference, robot, terrain=terrain, track=track, rest=config.rest)
 
     controlled = records[records["phase"] == ORDER.index(Phase.PLAY)]

@@ -27,6 +27,7 @@ Array = np.ndarray
 _ANGLE_CONFIDENCE = 0.5  # the trunk points are made from angles whose convention is only inferred
 _COLUMNS = 18
 _AGREES = 0.7  # mean resultant length of the difference of heading and feet: a spread of about 0.8 rad
+_SWAYS, _TOGETHER = 0.02, 0.8  # rad, spread of a roll that is one; correlation of the arms' and the legs' roll
 _TURN = 0.5  # s, standard deviation: over a stride, swinging limbs show which way the body looks
 
 
@@ -141,6 +142,31 @@ def _person(
         hands, feet = hands[:, ::-1], feet[:, ::-1]
     else:
         note("the first of each pair counts as the left one")
+    if np.ptp(root, axis=0).max() < 1e-6 * height:
+        hands, feet = _unrolled(root, hands, feet, ahead, note)
     names = ("pelvis", "left_wrist", "right_wrist", "left_ankle", "right_ankle")
     positions = np.concatenate([root[:, None], hands, feet], axis=1)
     return KeypointMotion(t=t, positions=positions, names=names, confidence=np.ones(positions.shape[:2]))
+
+
+def _unrolled(root: Array, hands: Array, feet: Array, ahead: Array, note: Callable[[str], None]) -> tuple[Array, Array]:
+    """Hands and feet (T, 2, 3) turned about the body's forward axis, where a body that never moves hides its roll.
+
+    In the plane of left and up, as complex numbers, a pair is turned by the angle a that makes its left l and right r
+    mirror images: exp(i a) l = -conj(exp(i a) r), so 2 a = arg(-conj(l r)). Where arms and legs swing together in it,
+    though they know nothing of each other, the whole body does; otherwise it is their own motion, and stays.
+    """
+    left = np.stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(ahead))], axis=1)
+    ends = np.concatenate([hands, feet], axis=1) - root[:, None]
+    plane = np.sum(ends * left[:, None], axis=2) + 1j * ends[..., 2]
+    mirrored = np.stack([-np.conj(plane[:, 0] * plane[:, 1]), -np.conj(plane[:, 2] * plane[:, 3])], axis=1)
+    arms, legs = (np.unwrap(np.angle(m)) / 2 for m in mirrored.T)
+    if min(np.std(arms), np.std(legs)) < _SWAYS or np.corrcoef(arms, legs)[0, 1] < _TOGETHER:
+        return hands, feet
+    roll = np.unwrap(np.angle(mirrored.sum(axis=1))) / 2
+    note(f"the body never moves, but arms and legs roll together: unrolled by {np.degrees(np.ptp(roll)):.0f} degrees")
+    turned = plane * np.exp(1j * roll)[:, None]
+    ends = ends + (turned - plane).real[..., None] * left[:, None]
+    ends[..., 2] = turned.imag
+    ends = ends + root[:, None]
+    return ends[:, :2], ends[:, 2:]

@@ -68,7 +68,7 @@ def joint_motion(robot: Robot, reference: Reference) -> JointMotion:
     """
     r, model = reference, robot.model
     T, nj = len(r.t), len(robot.effort)
-    legs = _Legs(robot)
+    legs = Legs(robot)
     root = np.array([legs.root(*state) for state in zip(r.q, r.v, strict=True)])  # (T, 7 + 6): pose and twist
     q, v = np.empty((T, model.nq)), np.empty((T, model.nv))
     q[:, :7], v[:, :6] = root[:, :7], root[:, 7:]
@@ -92,7 +92,7 @@ def joint_motion(robot: Robot, reference: Reference) -> JointMotion:
     return JointMotion(q, v, tau, tau_static, wrench, miss, reached=r.points - error)
 
 
-class _Legs:
+class Legs:
     """Contact frames of a robot: residual and Jacobian of inverse kinematics, and the root that carries the base.
 
     After `solve`, `error` (m) is the residual of its solution: 3 rows a point, then one a flat foot.
@@ -170,11 +170,11 @@ class _Legs:
             error[k] = self.error[: points[k].size].reshape(-1, 3)
         return joints, error
 
-    def solve(self, root: Array, joints: Array, points: Array, home: Array) -> Array:
+    def solve(self, root: Array, joints: Array, points: Array, home: Array, *, iterations: int = ITERATIONS) -> Array:
         """(nj,) rad that bring the contact frames to points (C, 3), from a first guess, with the root at (7,)."""
         lower, upper, scale = self.robot.lower, self.robot.upper, self._scale
         q = np.concatenate([root, joints])
-        for i in range(ITERATIONS):
+        for i in range(iterations):
             J = self.jacobian(q)[:, 6:] / scale
             e = self._residual(points)
             to_home, to_lower, to_upper = (scale * (x - q[7:]) for x in (home, lower, upper))

@@ -20,7 +20,7 @@ from slomo.stage import Arrays, Artifact, Inputs, Progress
 from slomo.synth.score import score
 from slomo.terrain import Terrain
 
-VERSION = 5
+VERSION = 6
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,8 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     weight = robot.mass * GRAVITY
     panels.append(ReferencePanel(reference, robot, terrain, hips=model.hips, weight=weight, azimuth=beside))
     fell = bool(track.json["metrics.json"]["fell"])
-    panels.append(RobotPanel(rollout, robot, terrain, azimuth=beside, fell=fell))
+    ground = Terrain.from_json(track.json["terrain.json"])
+    panels.append(RobotPanel(rollout, robot, ground, azimuth=beside, fell=fell))
 
     duration = float(reference.t[-1])
     falls = FootFalls(

@@ -8,6 +8,7 @@ from slomo.track.planner import PLANNERS
 
 JOINT_HZ = 500
 STATES = ("estimated", "truth")
+LAYERS = ("auto", "ik", "qp")
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,8 @@ class Config(MpcConfig):
         controller: "ci-mpc"; for comparison "convex-mpc" (contact schedule of the reference, see `convex_mpc`) or
             "open-loop" (see `open_loop`).
         state: what the controller knows: "estimated" from joint encoders and IMU, or "truth", for study.
-        joint_layer: from plan to joints: "ik" (inverse kinematics, PD and J^T forces).
+        joint_layer: from plan to joints: "ik" (inverse kinematics, PD and J^T forces, see `joint_space`), "qp" (see
+            `whole_body_qp`) or "auto": the one that does better with that kind of robot, see `layer_of`.
         mpc_hz: 1/s, a divisor of 500.
         kp: N m/rad, stiffness of the motor PD.
         kd: N m s/rad, its damping.
@@ -31,7 +33,7 @@ class Config(MpcConfig):
 
     controller: str = "ci-mpc"
     state: str = "estimated"
-    joint_layer: str = "ik"
+    joint_layer: str = "auto"
     mpc_hz: int = 100
     kp: float = 20.0
     kd: float = 1.0
@@ -42,11 +44,16 @@ class Config(MpcConfig):
     blend: float = 0.6
 
 
+def layer_of(config: Config, kind: str) -> str:
+    """ "ik" or "qp" for a robot of that kind: for a quadruped the first, for a humanoid the second, unless chosen."""
+    return {"quadruped": "ik", "humanoid": "qp"}[kind] if config.joint_layer == "auto" else config.joint_layer
+
+
 def check(config: Config) -> None:
     """Raises `UsageError` for a parameter out of range."""
     if config.mpc_hz <= 0 or JOINT_HZ % config.mpc_hz:
         raise UsageError(f"{config.mpc_hz} does not divide {JOINT_HZ}", where="track.mpc_hz", valid=(50, 100, 125, 250))
-    choices = (("controller", tuple(PLANNERS)), ("mpc_model", MODELS), ("state", STATES), ("joint_layer", ("ik",)))
+    choices = (("controller", tuple(PLANNERS)), ("mpc_model", MODELS), ("state", STATES), ("joint_layer", LAYERS))
     for name, valid in choices:
         if getattr(config, name) not in valid:
             raise UsageError(f"{getattr(config, name)!r}", where=f"track.{name}", valid=valid)

@@ -6,17 +6,22 @@ from slomo.motion import Reference
 from slomo.pointfoot import PointFootModel
 from slomo.robot import Robot
 from slomo.terrain import Terrain
-from slomo.track.config import Config
+from slomo.track.config import Config, layer_of
 from slomo.track.estimator import Estimator
 from slomo.track.joint_space import JointCommand, JointSpace
 from slomo.track.lead_in import with_lead_in
 from slomo.track.open_loop import STIFFER
 from slomo.track.plan import Plan
 from slomo.track.planner import make_planner
+from slomo.track.posture import standing_pose
 from slomo.track.sensors import SensorSample
+from slomo.track.whole_body_qp import WholeBodyQp
 
 Array = np.ndarray
 
+# s: how soon a standing foot tells where the ground is, and how soon that is forgotten in the air.
+FEELING, FORGETTING = 0.05, 0.3
+HIGHEST = 0.06  # m, by which the ground may be off
 STANDING = 3.0  # N, of planned force from which a point is planned to stand
 
 
@@ -31,6 +36,7 @@ class Controller:
     Attributes:
         reference: with the lead-in; it begins at reference.t[0] < 0, on the controller's clock.
         plan: the last one, None before the first tick.
+        shift: (C,) m, how much higher than planned the ground under each point is found to be.
         point_state: ((7 + 3 C,), (6 + 3 C,)) the state from which the last command was made, as in `motion.Reference`.
     """
 
@@ -44,10 +50,12 @@ class Controller:
     ):
         model = PointFootModel.from_robot(robot, mu=config.mu)
         self.robot, self.config, self.terrain = robot, config, terrain
-        self.reference = with_lead_in(reference, model, terrain=terrain, settle=config.settle, blend=config.blend)
+        self.reference = with_lead_in(
+            reference, model, standing=robot.nominal_feet, terrain=terrain, settle=config.settle, blend=config.blend
+        )
         self.planner = make_planner(config.controller, model, self.reference, terrain=terrain, config=config)
-        kp, kd = STIFFER if config.controller == "open-loop" else (1.0, 1.0)
-        self.joints = JointSpace(robot, kp=kp * config.kp, kd=kd * config.kd)
+        self.joints = JointSpace(robot)
+        self.layer = self._make_layer()
         self.estimator = Estimator(robot, terrain)
         self.plan: Plan | None = None
         self._begin()
@@ -55,8 +63,7 @@ class Controller:
     @property
     def first_pose(self) -> Array:
         """(nq,) in which the reference begins, standing."""
-        self.joints.reset()
-        return self.joints.pose(self.reference.q[0])
+        return standing_pose(self.robot, self.reference.q[0])
 
     def warm_up(self) -> float:
         """Compile everything that runs later; returns the seconds."""
@@ -94,13 +101,33 @@ class Controller:
         q, v = self.estimate(t)
         self.point_state = q_point, v_point = self.joints.state(q, v)
         if self.plan is None or t >= self._due - 1e-6:
-            self.plan = self.planner.step(t, q_point, v_point)
+            self._feel_ground(q_point)
+            self.plan = self.planner.step(t, q_point, v_point, shift=self.shift)
             period = 1 / self.config.mpc_hz
             self._due += period * max(1.0, np.floor((t - self._due) / period + 1e-3) + 1)
         u = self.plan.feedback(t, q_point, v_point)
-        return self.joints.command(self.plan.at(t), self.plan.at(t + self.config.lookahead), u=u, q=q, v=v)
+        return self.layer.command(self.plan.at(t), self.plan.at(t + self.config.lookahead), u=u, q=q, v=v)
+
+    def _make_layer(self) -> JointSpace | WholeBodyQp:
+        """From plan to joints: the layer that the parameters name."""
+        robot, config = self.robot, self.config
+        if config.controller == "open-loop":
+            return JointSpace(robot, kp=STIFFER[0] * config.kp, kd=STIFFER[1] * config.kd)
+        if layer_of(config, robot.kind) == "ik":
+            return JointSpace(robot, kp=config.kp, kd=config.kd)
+        return WholeBodyQp(robot, self.reference, terrain=self.terrain, mu=config.mu)
+
+    def _feel_ground(self, q_point: Array) -> None:
+        """Let `shift` follow the standing feet: the ground is where they are."""
+        points = q_point[7:].reshape(-1, 3)
+        off = np.clip(points[:, 2] - self.terrain.height(points), -HIGHEST, HIGHEST)
+        step = 1 / self.config.mpc_hz
+        stands = self.estimator.contact > 0.9
+        self.shift += np.where(stands, step / FEELING * (off - self.shift), -step / FORGETTING * self.shift)
 
     def _begin(self) -> None:
+        self.shift = np.zeros(len(self.robot.limbs))
         self.plan, self._due = None, float(self.reference.t[0])
         self.planner.reset()
+        self.layer.reset()
         self._true: tuple[Array, Array] | None = None

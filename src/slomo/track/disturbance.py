@@ -1,14 +1,17 @@
 """What the world does to the robot that the plan does not know."""
 
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slomo.errors import UsageError
 from slomo.terrain import Terrain
 
 Array = np.ndarray
 
 PUSH_SECONDS = 0.1
+_NUMBER = r"-?\d+(?:\.\d*)?|-?\.\d+"
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,14 @@ class Push:
     impulse: float
     time: float
     direction: float
+
+    @classmethod
+    def parse(cls, text: str) -> "Push":
+        """Of "12@1.5,90": 12 N s at 1.5 s towards +y. Raises `UsageError`."""
+        m = re.fullmatch(rf"\s*({_NUMBER})\s*@\s*({_NUMBER})\s*,\s*({_NUMBER})\s*", text)
+        if not m:
+            raise UsageError(f"no push {text!r}", where="track.push", todo="give N s @ s , degrees: 12@1.5,90")
+        return cls(*map(float, m.groups()))
 
     def force(self, t: float) -> Array:
         """(3,) N, world, at time t."""

@@ -9,6 +9,7 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
+import pinocchio as pin  # pyright: ignore[reportMissingImports]
 from scipy.spatial.transform import Rotation
 
 from slomo.pointfoot import GRAVITY
@@ -133,7 +134,7 @@ class Estimator:
         w = last.gyro - self._bias[:3]
         # A round foot rolls: its centre moves by the leg's turning times the radius, while the ground holds it.
         turning = (w + self._forces.J[:, 3:] @ last.v) @ self._R.T
-        drift = np.cross(turning, np.array([0.0, 0.0, 1.0])) * self._radius[:, None]
+        drift = np.stack([turning[:, 1], -turning[:, 0], np.zeros(len(turning))], axis=1) * self._radius[:, None]
         p = self.contact[feet]
         loose = np.clip((0.9 - p) / 0.4, 0.0, 1.0)
         drift *= (loose < 1)[:, None]
@@ -159,9 +160,9 @@ class Estimator:
         s = self._last
         ahead = max(t - s.t, 0.0)
         omega = s.gyro - self._bias[:3]
-        R = Rotation.from_matrix(self._R) * Rotation.from_rotvec(omega * ahead)
-        q = np.concatenate([self._p + ahead * self._v, R.as_quat(), s.q + ahead * s.v])
-        return q, np.concatenate([R.inv().apply(self._v), omega, s.v])
+        R = self._R @ pin.exp3(omega * ahead)
+        q = np.concatenate([self._p + ahead * self._v, pin.Quaternion(R).coeffs(), s.q + ahead * s.v])
+        return q, np.concatenate([R.T @ self._v, omega, s.v])
 
     @property
     def gyro_bias(self) -> Array:

@@ -124,7 +124,7 @@ class JointSpace:
         feet = (ahead.points - ahead.position) @ R
         joints = self.solve(feet)
         _, J = self._feet_in_root(joints)
-        relative = (ahead.point_velocities - ahead.velocity) @ R - np.cross(ahead.angular_velocity, feet)
+        relative = (ahead.point_velocities - ahead.velocity) @ R - feet @ pin.skew(ahead.angular_velocity).T
         speeds = _damped_solve(J, (relative @ self._T_root_base.rotation.T).ravel())
         _, J_now = self._feet_in_root(q[7:])
         R_root = _matrix(q[3:7])

@@ -1,11 +1,13 @@
 """How a motion is entered from standing still.
 
-A reference may begin at speed and with feet in the air, and no robot can. The lead-in stands in the reference's first
-pose with every foot on the ground, then gathers its velocity and lifts the feet that begin in the air. It is a
-kinematic blend with forces of near-static balance, for the controller to follow; it comes before t = 0.
+A reference may begin at speed, with feet in the air and its centre of mass beside the feet, and no robot can. The
+lead-in stands near the reference's first pose with every foot on the ground and bearing weight, then moves into it,
+gathers its velocity and lifts the feet that begin in the air. It is a kinematic blend with forces of near-static
+balance, for the controller to follow; it comes before t = 0.
 """
 
 import numpy as np
+from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
 from slomo.motion import Reference
@@ -14,14 +16,20 @@ from slomo.terrain import Terrain
 
 Array = np.ndarray
 
-SWING = 0.25  # s, in which a foot that begins in the air leaves the ground
+SWING = 0.3  # s, in which a foot that begins in the air leaves the ground
+LEAST = 0.4  # of an even share of the weight, what each foot bears in the stand
 IN_AIR = 0.005  # m, height from which a foot counts as in the air
 
 
 def with_lead_in(
-    reference: Reference, model: PointFootModel, *, terrain: Terrain, settle: float, blend: float
+    reference: Reference, model: PointFootModel, *, standing: Array, terrain: Terrain, settle: float, blend: float
 ) -> Reference:
-    """The reference with `settle` + `blend` (s) before its start, at negative times, in steps of its first h."""
+    """The reference with `settle` + `blend` (s) before its start, at negative times, in steps of its first h.
+
+    Args:
+        standing: (C, 3) m, base frame, where the points are when the robot just stands. Feet that begin in the air come
+            from there: under where they begin a leg may not reach the ground.
+    """
     h, T0 = float(reference.h[0]), settle + blend
     n = max(2, int(np.ceil(T0 / h)))
     t = np.arange(-n, 0) * h
@@ -30,7 +38,7 @@ def with_lead_in(
 
     # Body: x(s) = x0 + v0 T (s^3 - 1) / 3 ends at x0 with v0, and starts at rest without a jump of acceleration.
     # Height and orientation must also start where they end: z(s) = z0 + vz T (s^3 - s^2).
-    s = np.clip(1 + t / blend, 0, 1)
+    s_body = s = np.clip(1 + t / blend, 0, 1)
     there, back, speed_back = (s**3 - 1) * blend / 3, (s**3 - s**2) * blend, 3 * s**2 - 2 * s
     q[:, :2] += there[:, None] * v0[:2]
     q[:, 2] += back * v0[2]
@@ -42,16 +50,25 @@ def with_lead_in(
     speeds = v[:, 6:].reshape(n, -1, 3)
     stance = np.ones(points.shape[:2], bool)
     s = np.clip(1 + t / SWING, 0, 1)
-    for c, (p, w) in enumerate(zip(reference.points[0], v0[6:].reshape(-1, 3), strict=True)):
-        if p[2] - terrain.height(p) < IN_AIR:
-            continue
-        points[:, c, :2] += ((s**3 - 1) * SWING / 3)[:, None] * w[:2]
-        ground = terrain.height(points[:, c])
-        rise = s**2 * (3 - 2 * s)
-        points[:, c, 2] = ground + rise * (p[2] - ground)
-        speeds[:, c, :2] = (s**2)[:, None] * w[:2]
-        speeds[:, c, 2] = 6 * s * (1 - s) / SWING * (p[2] - ground)
+    arrive, speed = s**2 * (3 - 2 * s), 6 * s * (1 - s) / SWING
+    late, late_speed = (s**3 - s**2) * SWING, 3 * s**2 - 2 * s
+    p0, w0 = reference.points[0], v0[6:].reshape(-1, 3)
+    for c in np.flatnonzero(_lifted(model, p0, terrain)):
+        ground, end = _stand_at((q[0] + q0) / 2, standing[c], terrain), p0[c]
+        points[:, c] = ground + arrive[:, None] * (end - ground)
+        speeds[:, c] = speed[:, None] * (end - ground)
+        points[:, c, :2] += late[:, None] * w0[c, :2]
+        speeds[:, c, :2] += late_speed[:, None] * w0[c, :2]
+        points[:, c, 2] = np.maximum(points[:, c, 2], terrain.height(points[:, c]))
         stance[:, c] = s <= 0
+    for c in np.flatnonzero(model.is_hand):
+        points[:, c] += ((s**3 - 1) * SWING / 3)[:, None] * w0[c]
+        speeds[:, c] = (s**2)[:, None] * w0[c]
+        stance[:, c] = False
+    # The body stands where every foot bears weight, and comes from there, from rest to rest.
+    aside = _into_balance(model, q[0, :3], points[0])
+    q[:, :2] += (1 - s_body**3 * (10 - 15 * s_body + 6 * s_body**2))[:, None] * aside
+    v[:, :2] -= (30 * s_body**2 * (1 - s_body) ** 2 / blend)[:, None] * aside
 
     acceleration = np.gradient(v[:, :3], h, axis=0)
     u = np.array([balance(model, q[k, :3], points[k], stance[k], acceleration[k]) for k in range(n)])
@@ -66,6 +83,38 @@ def with_lead_in(
         point_names=reference.point_names,
         robot_digest=reference.robot_digest,
     )
+
+
+def _lifted(model: PointFootModel, points: Array, terrain: Terrain) -> Array:
+    """(C,) bool, which feet at points (C, 3) begin in the air; of toe and heel only both."""
+    lifted = (points[:, 2] - terrain.height(points) > IN_AIR) & ~model.is_hand
+    for toe, heel in model.pairs:
+        lifted[[toe, heel]] = lifted[toe] and lifted[heel]
+    return lifted
+
+
+def _stand_at(body: Array, foot: Array, terrain: Terrain) -> Array:
+    """(3,) m, on the ground under `foot` (3,) m of the base frame, for a body (7,) turned about the vertical only."""
+    heading = Rotation.from_euler("Z", Rotation.from_quat(body[3:7]).as_euler("ZYX")[0])
+    p = body[:3] + heading.apply(foot)
+    return np.append(p[:2], terrain.height(p))
+
+
+def _into_balance(model: PointFootModel, body: Array, points: Array) -> Array:
+    """(2,) m: by how much the body (3,) is to move so that every foot at points (C, 3) bears at least `LEAST`.
+
+    The shares w of the weight are those that bring sum w_c p_c nearest to where the centre of mass is.
+    """
+    feet = ~model.is_hand
+    mass = model.total_mass
+    com = (model.mass * body[:2] + model.foot_mass @ points[:, :2]) / mass
+    p, least = points[feet, :2], LEAST / feet.sum()
+    rest = 1 - LEAST
+    strong = 1e3  # the shares' sum against metres
+    A = np.vstack([p.T - com[:, None], np.full(feet.sum(), strong)])
+    b = np.append(-least * (p - com).sum(axis=0), strong * rest)
+    w = nnls(A, b)[0] + least
+    return (w @ p - com) * mass / model.mass
 
 
 def balance(model: PointFootModel, body: Array, points: Array, stance: Array, acceleration: Array) -> Array:

@@ -1,6 +1,6 @@
 """The controller and the simulated robot, each at its rate."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from slomo.track.controller import Controller
 from slomo.track.disturbance import Disturbance
 from slomo.track.joint_space import JointSpace
 from slomo.track.plan import PlanPoint
+from slomo.track.posture import standing_pose
 from slomo.track.recording import Recording, reference_at
 from slomo.track.sensors import SensorSample, SimulatedSensors
 from slomo.track.simulation import Simulation
@@ -28,9 +29,16 @@ LOWEST = 0.5  # of the height that the body should have
 
 @dataclass(frozen=True)
 class Outcome:
-    """rollout; `fall`: None or what happened; `torque_ratio`: (T,) largest |torque asked for| / limit at each tick."""
+    """How it went.
+
+    Attributes:
+        rollout, reference: what happened, and what was to happen, with the lead-in.
+        fall: None or what happened.
+        torque_ratio: (T,) largest |torque asked for| / limit at each tick.
+    """
 
     rollout: Rollout
+    reference: Reference
     fall: str | None
     torque_ratio: Array
     compile_seconds: float = 0.0
@@ -77,6 +85,8 @@ def simulate(
     t0, t1 = float(reference.t[0]), float(reference.t[-1])
     recording = Recording(robot, reference, ticks=round((t1 - t0) * JOINT_HZ))
     joints, fall = JointSpace(robot), None
+    bodies = reference_at(reference, t0 + np.arange(recording.ticks) / JOINT_HZ)[:, :3]
+    wanted = bodies[:, 2] - terrain.height(bodies)
     for k in range(round((t1 - t0) * MOTOR_HZ)):
         t = t0 + k / MOTOR_HZ
         q, v = simulation.q, simulation.v
@@ -98,16 +108,16 @@ def simulate(
                 controller, t=t, q=q, v=v, q_des=command.q, tau=tau, asked=asked, body=q_point[:7],
                 points=q_point[7:].reshape(-1, 3), lam=forces,
             )  # fmt: skip
-            wanted = reference_at(reference, np.array([t]))[0]
-            fall = _fallen(q_point, float(wanted[2] - terrain.height(wanted)), ground, robot, body_down)
+            fall = _fallen(q_point, float(wanted[k // (MOTOR_HZ // JOINT_HZ)]), ground, robot, body_down)
             if fall:
                 fall = f"{fall} at {t:.2f} s"
                 break
-        simulation.push(disturbance.force(t))
+        if disturbance.pushes:
+            simulation.push(disturbance.force(t))
         simulation.step(tau)
         if k % 50 == 0:
             progress.update((t - t0) / (t1 - t0), f"{t:.1f} of {t1:.1f} s")
-    return Outcome(recording.rollout(reference_digest), fall, recording.torque_ratio, compiling)
+    return Outcome(recording.rollout(reference_digest), reference, fall, recording.torque_ratio, compiling)
 
 
 def _stand(simulation: Simulation, reference: Reference, terrain: Terrain, ground: Terrain) -> Array:
@@ -122,10 +132,11 @@ def _stand(simulation: Simulation, reference: Reference, terrain: Terrain, groun
     q[2] += higher[robot.feet].mean()
     # Four times the effort a radian: a few millimetres of sag in any robot.
     joints = JointSpace(robot, kp=4 * robot.effort, kd=0.13 * robot.effort)
-    pose = joints.pose(q)
+    pose = standing_pose(robot, q)
     zero = np.zeros_like(reference.points[0])
     point = PlanPoint(q[:3], q[3:7], np.zeros(3), np.zeros(3), q[7:].reshape(-1, 3), zero, zero, zero)
     command = joints.command(point, point, u=reference.u[0].reshape(-1, 3), q=pose, v=np.zeros(robot.model.nv))
+    command = replace(command, q=pose[7:])
     motors = Motors(robot)
     motors.send(0.0, command)
     simulation.reset(pose)

@@ -5,9 +5,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slomo.motion import Rollout
+from slomo.motion import Reference, Rollout
+from slomo.robot import Robot
 
 Array = np.ndarray
+
+STANDING = 1.0  # N, vertical force from which a foot stands
+NEAR = 0.1  # s
+BOUNCE = 0.02  # s
 
 
 def errors(rollout: Rollout) -> dict[str, float | None]:
@@ -47,16 +52,77 @@ def estimate(rollout: Rollout) -> dict[str, float | None]:
     return {f"estimate_{name}": x for name, x in zip(names, values, strict=True)}
 
 
+def joints(rollout: Rollout, robot: Robot, *, torque_ratio: Array, lookahead: float) -> dict[str, float]:
+    """How well joints followed and how hard they worked.
+
+    `joint_rmse`: rad, of the angles from the targets, which are for `lookahead` (s) later.  `torque_ratio_p50`, `_p99`:
+    of the largest torque asked for, over its limit (torque_ratio (T,)).  `torque_saturated`: share of ticks at which
+    some motor was asked for more than its effort limit.  `speed_ratio_max`: largest joint speed over its limit.
+    `power_mean`: W, mechanical, what goes in and what brakes alike.
+    """
+    n = round(lookahead / (rollout.t[1] - rollout.t[0])) if len(rollout.t) > 1 else 0
+    n = min(n, len(rollout.t) - 1)
+    speeds = np.abs(rollout.v[:, 6:])
+    return {
+        "joint_rmse": _rms(rollout.q_des[: len(rollout.t) - n] - rollout.q[n:, 7:]),
+        "torque_ratio_p50": float(np.percentile(torque_ratio, 50)),
+        "torque_ratio_p99": float(np.percentile(torque_ratio, 99)),
+        "torque_saturated": float(np.mean(torque_ratio > 1)),
+        "speed_ratio_max": float(np.max(speeds / robot.velocity)),
+        "power_mean": float(np.sum(np.abs(rollout.tau) * speeds, axis=1).mean()),
+    }
+
+
+def contact_timing(rollout: Rollout, reference: Reference) -> dict[str, float | int | None]:
+    """How well touchdowns and lift-offs keep the reference's times, over t >= 0.
+
+    `contact_agreement`: share of time and feet in which both stand or neither does.  `contact_events`: touchdowns and
+    lift-offs of the reference;  `contact_events_missed`: those that the robot does not have within `NEAR` s;
+    `contact_timing_error`: s, mean of how much earlier or later it has the others.
+    """
+    on = rollout.t >= 0
+    t = rollout.t[on]
+    step = np.clip(np.searchsorted(reference.t, t, side="right") - 1, 0, len(reference.h) - 1)
+    planned, real = reference.lam[step, :, 2] > STANDING, rollout.lam[on, :, 2] > STANDING
+    errors, missed = [], 0
+    for c in range(real.shape[1]):
+        seen = _events(t, real[:, c])
+        for when, lands in _events(t, planned[:, c]):
+            off = [abs(when - at) for at, landed in seen if landed == lands]
+            if off and min(off) <= NEAR:
+                errors.append(min(off))
+            else:
+                missed += 1
+    return {
+        "contact_agreement": float(np.mean(planned == real)) if len(t) else None,
+        "contact_events": len(errors) + missed,
+        "contact_events_missed": missed,
+        "contact_timing_error": float(np.mean(errors)) if errors else None,
+    }
+
+
+def _events(t: Array, stands: Array) -> list[tuple[float, bool]]:
+    """Times at which a foot's state (T,) changes, and to what; states that last less than `BOUNCE` are no changes."""
+    edges = np.flatnonzero(np.diff(stands)) + 1
+    out: list[tuple[float, bool]] = []
+    for i, after in zip(edges, [*edges[1:], None], strict=True):
+        lasts = after is None or t[after] - t[i] >= BOUNCE
+        if lasts and stands[i] != (out[-1][1] if out else stands[0]):
+            out.append((float(t[i]), bool(stands[i])))
+    return out
+
+
 def solver(rollout: Rollout, *, period: float) -> dict[str, Any]:
     """The controller's wall times.
 
-    `mpc_ms_p50`, `mpc_ms_p99`: ms of a solve.  `missed_ticks`: solves that took longer than the period (s).
-    `mpc_kept_plans`: ticks at which the solver failed and the previous plan was kept.
+    `mpc_ms_p50`, `mpc_ms_p99`, `mpc_ms_max`: ms of a solve.  `missed_ticks`: solves that took longer than the period
+    (s).  `mpc_kept_plans`: ticks at which the solver failed and the previous plan was kept.
     """
     ms = rollout.mpc_ms
     return {
         "mpc_ms_p50": float(np.percentile(ms, 50)),
         "mpc_ms_p99": float(np.percentile(ms, 99)),
+        "mpc_ms_max": float(ms.max()),
         "missed_ticks": int(np.sum(ms > 1e3 * period)),
         "mpc_kept_plans": int(np.sum(rollout.mpc_status != 0)),
     }

@@ -38,14 +38,14 @@ class MpcConfig:
         horizon: number of steps.  dt: s, their length.
         iterations: most Newton steps a tick.  tolerance: relative decrease of the cost that ends them.
         mu: friction coefficient to plan with.  kappa: N m, smoothing of the contact.
-        effort: 1/N^2, weight of the deviation from the reference's forces.
+        effort: of the deviation from the reference's forces, as shares of the robot's weight.
         terminal: s, weight of the end state (as if it lasted that long).
     """
 
     mpc_model: str = "ncp"
     horizon: int = 10
     dt: float = 0.025
-    iterations: int = 4
+    iterations: int = 2
     tolerance: float = 1e-6
     mu: float = 0.6
     kappa: float = 1e-3
@@ -56,10 +56,10 @@ class MpcConfig:
     velocity: float = 10.0
     angular_velocity: float = 2.0
     foot_velocity: float = 0.5
-    effort: float = 2e-4
+    effort: float = 3.3
     acceleration: float = 0.0
     slip: float = 300.0
-    slip_load: float = 2.0
+    slip_load: float = 0.0156
     terminal: float = 0.1
 
 
@@ -89,12 +89,13 @@ class Mpc:
         w[:, 6:nv] = np.tile([c.foot, c.foot, c.foot_height], C)
         w[:, nv : nv + 3], w[:, nv + 3 : nv + 6], w[:, nv + 6 :] = c.velocity, c.angular_velocity, c.foot_velocity
         h = np.append(np.full(H, c.dt), c.terminal)
+        weight = model.total_mass * model.g
         self._task = Task(
             h=h, ground=np.tile([0.0, 0.0, 1.0, 0.0], (H + 1, C, 1)), stick=np.zeros((H, C), bool),
             q_ref=np.zeros((H + 1, nv + 1)), v_ref=np.zeros((H + 1, nv)),
-            u_ref=np.zeros((H, 3 * C)), w_x=w, w_u=np.full((H, 3 * C), c.effort),
+            u_ref=np.zeros((H, 3 * C)), w_x=w, w_u=np.full((H, 3 * C), c.effort / weight**2),
             u_low=np.tile(-model.u_max.ravel(), (H, 1)), u_high=np.tile(model.u_max.ravel(), (H, 1)),
-            w_acceleration=c.acceleration, w_spin=0.0, w_slip=c.slip, slip_load=c.slip_load, cyclic=False,
+            w_acceleration=c.acceleration, w_spin=0.0, w_slip=c.slip, slip_load=c.slip_load * weight, cyclic=False,
             shift=np.zeros(4), linear=NONLINEAR if c.mpc_model == "ncp" else LinearBody.zeros(H, C),
         )  # fmt: skip
         self._work = Work.make(self._new_iterate())

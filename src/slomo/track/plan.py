@@ -55,6 +55,7 @@ class PlanPoint:
     Attributes:
         position: (3,) m.  quat_xyzw: (4,).  velocity: (3,) m/s.  angular_velocity: (3,) rad/s, body frame.
         points, point_velocities: (C, 3) m, m/s.  u: (C, 3) N, of each point on the body.  lam: (C, 3) N, of the ground.
+        t: s, the time.
     """
 
     position: Array
@@ -65,6 +66,7 @@ class PlanPoint:
     point_velocities: Array
     u: Array
     lam: Array
+    t: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,7 @@ class Plan:
             point_velocities=v[6:].reshape(-1, 3),
             u=u.reshape(-1, 3),
             lam=self.lam[self._step(t)],
+            t=t,
         )
 
     def feedback(self, t: float, q: Array, v: Array) -> Array:

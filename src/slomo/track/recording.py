@@ -25,7 +25,7 @@ class Recording:
             t=(), q=(7 + nj,), v=(6 + nj,), q_des=(nj,), tau=(nj,), asked=(nj,), body=(7,), points=(C, 3), lam=(C, 3),
             body_est=(7,), contact_est=(C,),
         )  # fmt: skip
-        self.robot, self.reference = robot, reference
+        self.robot, self.reference, self.ticks = robot, reference, ticks
         self._rows = {name: np.zeros((ticks, *shape)) for name, shape in shapes.items()}
         self._solves = {name: np.zeros(ticks) for name in ("mpc_t", "mpc_ms", "mpc_status")}
         self._n, self._solved, self._plan = 0, 0, None

@@ -16,6 +16,7 @@ from slomo.robot import Robot
 from slomo.robot_file import find_mesh
 from slomo.terrain import Terrain
 from slomo.track.simulated_ground import add_ground
+from slomo.track.sole import contact_points
 
 Array = np.ndarray
 
@@ -98,14 +99,24 @@ def _prepare(spec: mujoco.MjSpec, robot: Robot, friction: float, inertias: list[
     for mesh in spec.meshes:
         hull = trimesh.load(find_mesh(mesh.file, robot.urdf, robot.package_dirs), force="mesh").convex_hull
         mesh.file, mesh.uservert = "", np.asarray(hull.vertices, float).ravel()
+    points = contact_points(robot)
+    soles = {robot.limbs[c].link for c in robot.pairs.ravel()}
     for link in {limb.link for limb in robot.limbs}:
-        for geom in list(spec.body(link).geoms):
+        body = spec.body(link)
+        for geom in list(body.geoms):
             spec.delete(geom)
-    for limb in robot.limbs:
+        while link in soles and not body.joints:  # the sole may be a link of its own, fixed to the foot
+            body = body.parent
+            for geom in list(body.geoms):
+                spec.delete(geom)
+    for c, limb in enumerate(robot.limbs):
         foot, radius = spec.body(limb.link), limb.foot_radius or SOLE
-        # The sphere of a point on a sole lies above it.
-        centre = np.array(limb.offset) + (radius - limb.foot_radius) * _up(robot, limb.link)
-        foot.add_geom(name=limb.foot, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], pos=centre)
+        offsets = [p.offset for p in points if p.limb == c] or [np.zeros(3)]
+        for i, offset in enumerate(offsets):
+            # The sphere of a point on a sole lies above it.
+            centre = np.array(limb.offset) + offset + (radius - limb.foot_radius) * _up(robot, limb.link)
+            sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+            foot.add_geom(name=f"{limb.foot}:{i}", type=sphere, size=[radius, 0, 0], pos=centre)
         foot.add_site(name=limb.foot, pos=limb.offset)
     spec.worldbody.first_body().add_site(name=IMU)
     spec.add_sensor(name=IMU, type=mujoco.mjtSensor.mjSENS_ACCELEROMETER, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=IMU)
@@ -154,8 +165,10 @@ class Simulation:
         self._qpos, self._qvel = self.model.jnt_qposadr[ids], self.model.jnt_dofadr[ids]
         self._sites = np.array([self.model.site(name).id for name in robot.foot_names])
         self._foot_of_geom = np.full(self.model.ngeom, -1)
-        for c, name in enumerate(robot.foot_names):
-            self._foot_of_geom[self.model.geom(name).id] = c
+        for g in range(self.model.ngeom):
+            name = self.model.geom(g).name.rpartition(":")[0]
+            if name in robot.foot_names:
+                self._foot_of_geom[g] = robot.foot_names.index(name)
         self._root_body = int(self.model.jnt_bodyid[self.model.joint("root").id])
         self._push_at = robot.model.frames[robot.model.getFrameId(robot.base)].placement.translation
 
