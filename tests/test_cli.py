@@ -67,7 +67,7 @@ def test_help_starts_fast():
 def test_usage_errors_end_with_2(project):
     for args in (["nonsense"], ["run", "clip.txt"], ["status", "--nonsense"], ["retarget", "--robot"]):
         run(*args, code=2)
-    assert "where is the robot? (valid: --sim)" in run("track", "--robot", "go1", code=2).stderr
+    assert "what is to be done? (valid: --sim, " in run("track", "--robot", "go1", code=2).stderr
     said = run("run", "clip.txt", "--robot", "spot", code=2).stderr
     assert said.endswith("slomo: --robot: no robot named 'spot' (valid: a1, go1)\n")
 

@@ -1,4 +1,4 @@
-"""The paper's quadruped motions through retarget, optimize and track, on the Go1."""
+"""The paper's quadruped motions through retarget, optimize and track, on the Go1, with the estimated state."""
 
 import json
 from pathlib import Path
@@ -14,15 +14,10 @@ from slomo.track import stage as track
 
 KEYPOINTS = Path(__file__).parents[2] / "shared" / "keypoints"
 
-# m, m, degrees: body and feet of the cat under inverse kinematics and PD with the true state, in an earlier study.
-LIMITS = {"body_rmse": 0.016, "foot_rmse": 0.035, "orientation_rmse": 2.0}
+LIMITS = {"body_rmse": 0.03, "foot_rmse": 0.04, "orientation_rmse": 5.0}  # m, m, degrees
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "step", "frames"), [("cat00", 0.0, None), ("dog_cpr", 0.1, (26, 108))], ids=["cat", "dog on a step"]
-)
-def test_paper_motion_is_tracked(name, step, frames):
+def planned(name, *, step=0.0, frames=None, **options):
     path = KEYPOINTS / f"{name}.json"
     if not path.is_file():
         pytest.skip(f"no {path}")
@@ -31,11 +26,36 @@ def test_paper_motion_is_tracked(name, step, frames):
     robot = load_robot("go1")
     source = Artifact(npz={"keypoints.npz": load_keypoints(path).to_arrays()})
     moved = retarget.run(Inputs({"import": source}, {}, robot), retarget.Config(step_height=step, **part), Silent())
-    reference = optimize.run(Inputs({"retarget": moved}, {}, robot), optimize.Config(), Silent())
+    reference = optimize.run(Inputs({"retarget": moved}, {}, robot), optimize.Config(**options), Silent())
     assert reference.failure is None
-    artifact = track.run(Inputs({"optimize": reference}, {}, robot), track.Config(), Silent())
+    return Inputs({"optimize": reference}, {}, robot)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("higher", [0.0, 0.02, -0.02], ids=["as planned", "2 cm higher", "2 cm lower"])
+@pytest.mark.parametrize(
+    ("name", "step", "frames"), [("cat00", 0.0, None), ("dog_cpr", 0.1, (26, 108))], ids=["cat", "dog on a step"]
+)
+def test_paper_motion_is_tracked(name, step, frames, higher):
+    if higher and not step:
+        pytest.skip("no step to be higher")
+    artifact = track.run(planned(name, step=step, frames=frames), track.Config(step_height=higher), Silent())
     metrics = artifact.json["metrics.json"]
     assert artifact.failure is None
     assert {k: metrics[k] for k in LIMITS if metrics[k] > LIMITS[k]} == {}
+    assert metrics["state"] == "estimated"
     assert metrics["simulated_seconds"] > 3
-    assert metrics["torque_ratio_p99"] < 1
+    assert metrics["torque_ratio_p99"] < 1.1
+    assert metrics["estimate_rmse"] < 0.02
+
+
+@pytest.mark.slow
+def test_the_cat_walks_for_a_minute():
+    """Where it gets to is not observed; that it walks on, upright and at its height, is."""
+    artifact = track.run(planned("cat00", cyclic=True), track.Config(seconds=60.0), Silent())
+    assert artifact.failure is None
+    metrics = artifact.json["metrics.json"]
+    assert metrics["simulated_seconds"] > 60
+    assert metrics["estimate_height_rmse"] < 0.01
+    assert metrics["estimate_tilt_rmse"] < 2
+    assert metrics["contact_agreement"] > 0.8

@@ -15,7 +15,7 @@ import pinocchio as pin  # pyright: ignore[reportMissingImports]
 from slomo.errors import InvalidData
 from slomo.robot_body import point_foot_body, rigid_groups, swing_masses
 from slomo.robot_file import HUMANOID_LIMBS, find_robot_file, find_urdf, read_robot_file, robot_folders
-from slomo.robot_limbs import Point, force_limits, frame_point, leg_root, reach, underside
+from slomo.robot_limbs import Point, force_limits, frame_point, leg_root, reaches, underside
 from slomo.robot_model import (
     Limb,
     add_frame,
@@ -237,24 +237,9 @@ class Robot:
         return [leg_root(self.model, q, limb.hip, limb.foot, lower=lower, upper=upper) for limb in self.limbs]
 
     def _reach(self, starts: list[Point]) -> Array:
-        """(C, 2) m, least and greatest distance of C points from the foot frames.
-
-        The greatest distances r of toe and heel are such that the point of the sole under the ankle, at most l from the
-        start, stays within reach whenever both hold: r_i^2 = l^2 + s_i^2 for points at s_i from it (Stewart's theorem).
-        """
-
-        def distances(start: Point, end: Point) -> tuple[float, float]:
-            return reach(self.model, self.q_nominal, start, end, lower=self.lower, upper=self.upper)
-
+        """(C, 2) m, least and greatest distance of C points from the foot frames (see `robot_limbs.reaches`)."""
         feet = [frame_point(self.model, name) for name in self.foot_names]
-        out = np.array([distances(start, foot) for start, foot in zip(starts, feet, strict=True)])
-        for pair in self.pairs:
-            a, b = (feet[c].at for c in pair)
-            share = np.clip(-a @ (b - a) / ((b - a) @ (b - a)), 0, 1)
-            sole = a + share * (b - a)  # the joint's origin, which is the ankle, projected on the line from a to b
-            _, length = distances(starts[pair[0]], Point(feet[pair[0]].joint, sole))
-            out[pair, 1] = [np.hypot(length, np.linalg.norm(p - sole)) for p in (a, b)]
-        return out
+        return reaches(self.model, self.q_nominal, starts, feet, pairs=self.pairs, lower=self.lower, upper=self.upper)
 
 
 def key_point_names(limbs: tuple[str, ...]) -> tuple[str, ...]:

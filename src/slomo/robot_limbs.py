@@ -105,6 +105,30 @@ def reach(model: pin.Model, q: Array, start: Point, end: Point, *, lower: Array,
     return ends[0], ends[1]
 
 
+def reaches(
+    model: pin.Model, q: Array, starts: list[Point], feet: list[Point], *, pairs: Array, lower: Array, upper: Array
+) -> Array:
+    """(C, 2) m, least and greatest distance of C starts from C feet (see `reach`).
+
+    Args:
+        pairs: (P, 2) columns of toe and heel. Their greatest distances r are such that the point of the sole under the
+            ankle, at most l from the start, stays within reach whenever both hold: r_i^2 = l^2 + s_i^2 for points at
+            s_i from it (Stewart's theorem).
+    """
+
+    def distances(start: Point, end: Point) -> tuple[float, float]:
+        return reach(model, q, start, end, lower=lower, upper=upper)
+
+    out = np.array([distances(start, foot) for start, foot in zip(starts, feet, strict=True)])
+    for pair in pairs:
+        a, b = (feet[c].at for c in pair)
+        share = np.clip(-a @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+        sole = a + share * (b - a)  # the joint's origin, which is the ankle, projected on the line from a to b
+        _, length = distances(starts[pair[0]], Point(feet[pair[0]].joint, sole))
+        out[pair, 1] = [np.hypot(length, np.linalg.norm(p - sole)) for p in (a, b)]
+    return out
+
+
 def force_limits(jacobians: Array, effort: Array) -> Array:
     """(C, 3) N, the largest forces along the world's axes, each axis alone, that the joints' efforts allow.
 

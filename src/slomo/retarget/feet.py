@@ -8,6 +8,7 @@ from scipy.ndimage import gaussian_filter1d, median_filter, minimum_filter1d
 from slomo.retarget.clean import runs
 
 _HELD = 0.3  # of the legs' length: a foot whose floor is this much higher than the other one's of its pair never stands
+_JUMP = 0.16  # s, flight of a jump of three centimetres
 _SLOW = 0.35  # of a foot's swing speed
 _REARED = 0.5  # the same for a pair whose floor is higher than the other pair's, which a tilted camera also gives
 
@@ -95,6 +96,20 @@ def stance(lift: np.ndarray, speed: np.ndarray, *, dt: float, clearance: float, 
     noise, swing = np.percentile(speed, [25, 95], axis=0)
     slow = speed < np.maximum(np.maximum(_SLOW * swing, np.minimum(3 * noise, 0.6 * swing)), 0.12)
     return settled(slow & (lift < clearance), dt=dt, shortest=shortest)
+
+
+def slow_motion(standing: np.ndarray, *, dt: float) -> float:
+    """How many times as fast a motion must be played for its flights to last as long as jumps; 1 if they do.
+
+    Without the body's height nothing shows that feet which all leave the ground at once, as in a jumping jack, are in
+    a jump; but if they are, it is one of a few centimetres.
+
+    Args:
+        standing: (T, F) bool.
+    """
+    flights = [b - a for a, b in runs(~standing.any(axis=1)) if a > 0 and b < len(standing)]
+    usual = dt * float(np.median(flights)) if len(flights) > 1 else 0.0
+    return usual / _JUMP if usual > 2 * _JUMP else 1.0
 
 
 def slowness(xy: np.ndarray, *, dt: float) -> np.ndarray:

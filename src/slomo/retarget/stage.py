@@ -6,7 +6,7 @@ so that Froude numbers, and with them the character of the gait, change as littl
 have one of their own.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
@@ -15,13 +15,14 @@ import numpy as np
 from slomo.errors import InvalidData, UsageError
 from slomo.motion import KeypointMotion
 from slomo.retarget import ground, human, place, prepare, quadruped
+from slomo.retarget.feet import slow_motion
 from slomo.retarget.footprint import make_terrain, on_step, start_at_origin
 from slomo.retarget.soles import RobotBody
 from slomo.robot import Robot
-from slomo.stage import Artifact, Inputs, Progress
+from slomo.stage import Artifact, Inputs, Progress, Silent
 from slomo.terrain import Terrain
 
-VERSION = 5
+VERSION = 6
 
 
 @dataclass(frozen=True)
@@ -70,15 +71,14 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     stepping = on_step(body, config.step_limbs, robot.limb_names) if config.step_height else np.zeros(0, bool)
     report: dict[str, Any] = {"robot": robot.name, "subject": "animal" if kind is quadruped else "person"}
 
-    motion = prepare.prepare(source, kind.trunk_of, kind.PAIRS, config, report, progress)
-    progress.update(0.3, "smoothing")
-    quick = {n for limb in kind.LIMBS for n in kind.ends(limb)}
-    subject = kind.read(prepare.smoothed(motion, quick, config))
-    for line in subject.said:
-        progress.note(line)
-    walk = ground.grounded(subject, body, config, stepping, report, progress)
-
     dt = 1 / config.rate
+    motion, subject, walk = _on_the_ground(source, kind, body, config, stepping, report, progress)
+    if subject.fixed and (slower := slow_motion(walk.standing[:, walk.known], dt=dt)) > 1:
+        progress.note(f"no jump lasts as long as both feet are in the air here: played {slower:.1f} times as fast")
+        source = replace(source, t=source.t[0] + (source.t - source.t[0]) / slower)
+        config = replace(config, start=config.start / slower, end=config.end / slower)
+        motion, subject, walk = _on_the_ground(source, kind, body, config, stepping, report, Silent())
+        report["played_faster"] = slower
     paths, trunk = start_at_origin(walk.paths, walk.trunk, body)
     progress.update(0.7, "terrain")
     if given is not None:
@@ -118,6 +118,25 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     return Artifact(
         npz={"keypoints.npz": result.to_arrays()}, json={"terrain.json": terrain.to_json(), "report.json": report}
     )
+
+
+def _on_the_ground(
+    source: KeypointMotion,
+    kind: ModuleType,
+    body: RobotBody,
+    config: Config,
+    stepping: np.ndarray,
+    report: dict[str, Any],
+    progress: Progress,
+) -> tuple[KeypointMotion, Any, ground.Walk]:
+    """The usable part of the key points, what they say of the creature, and its soles on the ground."""
+    motion = prepare.prepare(source, kind.trunk_of, kind.PAIRS, config, report, progress)
+    progress.update(0.3, "smoothing")
+    quick = {n for limb in kind.LIMBS for n in kind.ends(limb)}
+    subject = kind.read(prepare.smoothed(motion, quick, config))
+    for line in subject.said:
+        progress.note(line)
+    return motion, subject, ground.grounded(subject, body, config, stepping, report, progress)
 
 
 def _kind(source: KeypointMotion, robot: Robot) -> ModuleType:

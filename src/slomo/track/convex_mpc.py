@@ -64,6 +64,8 @@ class ConvexMpc:
     def step(self, t: float, q: Array, v: Array, *, shift: Array | float = 0.0) -> Plan:
         """Plan from the measured state; arguments as of `mpc.Mpc.step`."""
         start = time.perf_counter()
+        if self._plan is not None and not (np.all(np.isfinite(q)) and np.all(np.isfinite(v))):
+            return self._keep(start)
         c, C, r = self.config, self.model.C, self.reference
         H, h = c.horizon, c.dt
         knots = t + h * np.arange(H + 1)
@@ -80,9 +82,7 @@ class ConvexMpc:
         problem = _condensed(x0[0], x_ref[:, 2], arms, self._mass.sum(), self._inertia, self.model.g, h)
         forces = self._solve(problem, x_ref[1:], forces_ref, stance)
         if forces is None:
-            assert self._plan is not None
-            self._plan = replace(self._plan, status=1, seconds=time.perf_counter() - start)
-            return self._plan
+            return self._keep(start)
 
         x = np.vstack([x0, (problem[0] + problem[1] @ forces.ravel()).reshape(H, 12)])
         q_plan, v_plan = q_ref.copy(), v_ref.copy()
@@ -102,6 +102,12 @@ class ConvexMpc:
             t=knots, q=q_plan, v=v_plan, u=u.reshape(H, -1), lam=forces, gains=np.zeros((H, 3 * C, 12 + 6 * C)),
             u_max=self.model.u_max.ravel(), status=0, defect=0.0, seconds=time.perf_counter() - start,
         )  # fmt: skip
+        return self._plan
+
+    def _keep(self, start: float) -> Plan:
+        """The last plan goes on."""
+        assert self._plan is not None
+        self._plan = replace(self._plan, status=1, seconds=time.perf_counter() - start)
         return self._plan
 
     def _body_states(self, q: Array, v: Array, near: Array) -> Array:
@@ -146,7 +152,7 @@ class ConvexMpc:
         h = np.full(H, c.dt)
         h[-1] += c.terminal
         w = (h[:, None] * self._w_x).ravel()
-        effort = c.dt * c.effort
+        effort = c.dt * c.effort / (self._mass.sum() * self.model.g) ** 2
         P = S.T @ (w[:, None] * S) + effort * np.eye(len(used))
         g = S.T @ (w * (free - x_ref.ravel())) - effort * forces_ref.ravel()[used]
         n, mu = len(used) // 3, c.mu

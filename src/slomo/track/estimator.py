@@ -21,6 +21,9 @@ from slomo.track.sensors import SensorSample
 
 Array = np.ndarray
 
+STILL = 0.05  # rad/s, joint speed under which a robot on all its feet stands still
+SLOW = 0.05  # s, over which that speed is averaged
+
 
 @dataclass(frozen=True)
 class Tuning:
@@ -30,17 +33,19 @@ class Tuning:
         gyro: rad/s/sqrt(Hz).  accelerometer: m/s^2/sqrt(Hz).
         gyro_walk, accelerometer_walk: of the biases, rad/s/sqrt(s) and m/s^2/sqrt(s).
         leg: m, of where kinematics have a foot.
-        stance: m/sqrt(s), how a standing foot wanders.  swing: the same of one in the air, which then tells nothing.
+        stance: m/sqrt(s), how a standing foot wanders.  rest: while the robot stands still, which shows the bias of
+            the gyroscope.  swing: in the air, where a foot tells nothing.
         ground: m, of the terrain's height where a foot comes down. Each touchdown pulls this softly, once.
         tilt: rad, gyro_bias: rad/s, accelerometer_bias: m/s^2, height: m, speed: m/s, in the beginning.
     """
 
-    gyro: float = 1e-3
+    gyro: float = 4e-4
     accelerometer: float = 2e-2
-    gyro_walk: float = 1e-4
+    gyro_walk: float = 2e-5
     accelerometer_walk: float = 1e-3
     leg: float = 2e-3
     stance: float = 5e-3
+    rest: float = 2e-4
     swing: float = 3.0
     ground: float = 0.02
     tilt: float = 0.02
@@ -116,6 +121,7 @@ class Estimator:
         P[n - 3 :, n - 3 :] = tuning.accelerometer_bias**2 * np.eye(3)
         self._P = P
         self._stands = np.ones(N, bool)
+        self._speed = sample.v.copy()
         self.contact[self.robot.feet] = 1.0
         for c in range(N):
             self._touch_down(c)
@@ -138,10 +144,12 @@ class Estimator:
         p = self.contact[feet]
         loose = np.clip((0.9 - p) / 0.4, 0.0, 1.0)
         drift *= (loose < 1)[:, None]
+        still = self._stands.all() and np.abs(self._speed).max() < STILL
+        stance = tuning.rest if still else tuning.stance
         inekf.predict(
             *self._state, last.gyro, last.acceleration, drift, dt, GRAVITY,
             np.array([tuning.gyro, tuning.accelerometer, tuning.gyro_walk, tuning.accelerometer_walk]),
-            tuning.stance + loose**2 * tuning.swing,
+            stance + loose**2 * tuning.swing,
         )  # fmt: skip
         self.force = self._forces.update(sample) @ self._R.T
         inekf.correct_legs(*self._state, self._forces.at, tuning.leg)
@@ -153,6 +161,7 @@ class Estimator:
         for c in np.flatnonzero(stands & ~self._stands):
             self._touch_down(int(c))
         self._stands = stands
+        self._speed += dt / SLOW * (sample.v - self._speed)
         self._last = sample
 
     def state(self, t: float) -> tuple[Array, Array]:

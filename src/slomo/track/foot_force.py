@@ -11,7 +11,7 @@ from slomo.track.sensors import SensorSample
 Array = np.ndarray
 
 SMOOTHING = 0.004  # s, time constant of torques and accelerations
-DAMPING = 1e-3  # m^2, of the least squares, against a leg's 0.02 to 0.1: it acts near stretched legs only
+DAMPING = 1e-4  # m^2, of the least squares, against 0.02 to 0.1 of a leg: it acts near stretched legs only
 
 
 class FootForces:

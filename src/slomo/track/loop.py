@@ -22,7 +22,8 @@ from slomo.track.simulation import Simulation
 Array = np.ndarray
 
 MOTOR_HZ = 1000
-STAND = 0.5  # s, before the controller begins
+# s, standing before the controller begins: until the robot is still, and then, while the estimator is at work already.
+STAND, REST = 0.5, 0.5
 LARGEST_TILT = 60.0  # degrees
 LOWEST = 0.5  # of the height that the body should have
 
@@ -81,7 +82,7 @@ def simulate(
     motors = Motors(robot, delay=config.command_delay + disturbance.latency)
     sensors = SimulatedSensors(len(robot.joint_names), seed=disturbance.seed)
     encoder = sensors.q_bias if estimated else 0.0
-    tau = _stand(simulation, reference, terrain, ground)
+    tau = _stand(simulation, controller, ground, sensors if estimated else None)
     t0, t1 = float(reference.t[0]), float(reference.t[-1])
     recording = Recording(robot, reference, ticks=round((t1 - t0) * JOINT_HZ))
     joints, fall = JointSpace(robot), None
@@ -94,7 +95,7 @@ def simulate(
             controller.observe(q, v)
         else:
             sample = sensors.read(SensorSample(t, q[7:], v[6:], tau, v[3:6], simulation.acceleration))
-            controller.sense(sample) if k else controller.start(sample)
+            controller.sense(sample)
         tick = k % (MOTOR_HZ // JOINT_HZ) == 0
         if tick:
             command = controller.command(t)
@@ -120,12 +121,13 @@ def simulate(
     return Outcome(recording.rollout(reference_digest), reference, fall, recording.torque_ratio, compiling)
 
 
-def _stand(simulation: Simulation, reference: Reference, terrain: Terrain, ground: Terrain) -> Array:
+def _stand(simulation: Simulation, controller: Controller, ground: Terrain, sensors: SimulatedSensors | None) -> Array:
     """Let the robot stand in the reference's first pose under stiff motors; returns their last torques (nj,) N m.
 
-    Where the ground is not as planned, each foot is as much higher, and the body by their mean.
+    Where the ground is not as planned, each foot is as much higher, and the body by their mean. With sensors the
+    controller is started, and senses on until its reference begins.
     """
-    robot = simulation.robot
+    robot, reference, terrain = simulation.robot, controller.reference, controller.terrain
     q = reference.q[0].copy()
     higher = ground.height(reference.points[0]) - terrain.height(reference.points[0])
     q[9::3] += higher
@@ -141,9 +143,14 @@ def _stand(simulation: Simulation, reference: Reference, terrain: Terrain, groun
     motors.send(0.0, command)
     simulation.reset(pose)
     tau = command.tau
-    for _ in range(round(STAND * MOTOR_HZ)):
-        v = simulation.v[6:]
-        tau = motors.limited(motors.asked(0.0, simulation.q[7:], v), v)
+    first, last = round(STAND * MOTOR_HZ), round((STAND + REST) * MOTOR_HZ)
+    for k in range(last):
+        q, v = simulation.q[7:], simulation.v
+        if sensors and k >= first:
+            t = float(reference.t[0]) - (last - k) / MOTOR_HZ
+            sample = sensors.read(SensorSample(t, q, v[6:], tau, v[3:6], simulation.acceleration))
+            controller.start(sample) if k == first else controller.sense(sample)
+        tau = motors.limited(motors.asked(0.0, q, v[6:]), v[6:])
         simulation.step(tau)
     return tau
 

@@ -40,6 +40,7 @@ class MpcConfig:
         mu: friction coefficient to plan with.  kappa: N m, smoothing of the contact.
         effort: of the deviation from the reference's forces, as shares of the robot's weight.
         terminal: s, weight of the end state (as if it lasted that long).
+        stride: how far, as a share of the body's height, its capture point may be off before the feet go there.
     """
 
     mpc_model: str = "ncp"
@@ -51,7 +52,7 @@ class MpcConfig:
     kappa: float = 1e-3
     position: float = 1000.0
     orientation: float = 300.0
-    foot: float = 300.0
+    foot: float = 1000.0
     foot_height: float = 500.0
     velocity: float = 10.0
     angular_velocity: float = 2.0
@@ -61,6 +62,7 @@ class MpcConfig:
     slip: float = 300.0
     slip_load: float = 0.0156
     terminal: float = 0.1
+    stride: float = 0.1
 
 
 class Mpc:
@@ -98,6 +100,7 @@ class Mpc:
             w_acceleration=c.acceleration, w_spin=0.0, w_slip=c.slip, slip_load=c.slip_load * weight, cyclic=False,
             shift=np.zeros(4), linear=NONLINEAR if c.mpc_model == "ncp" else LinearBody.zeros(H, C),
         )  # fmt: skip
+        self._feet = np.flatnonzero(np.isfinite(model.clearance))  # not the hands
         self._work = Work.make(self._new_iterate())
         r = reference
         self._t_ref, self._q_ref, self._v_ref, self._u_ref = (
@@ -139,6 +142,22 @@ class Mpc:
         linear.q[:], linear.v[:], linear.u[:] = task.q_ref, task.v_ref, task.u_ref
         linearize_reference(self._body, task.h, linear, 0, 1)
 
+    def _catch(self, q: Array, v: Array) -> None:
+        """Move the feet's wanted places under a body that has been pushed off the reference.
+
+        No step to the side is worth its cost within a short horizon as long as the feet are wanted where they were. So
+        they are wanted where they can stop the body: off by its displacement and sqrt(height / g) times its excess
+        speed (the capture point of Pratt et al. 2006; where Raibert placed feet), less a dead zone, in which small
+        errors leave them in their places. When they go there is still the solver's choice.
+        """
+        task = self._task
+        away, excess = q[:2] - task.q_ref[0, :2], v[:2] - task.v_ref[0, :2]
+        height = max(q[2] - float(task.q_ref[0, 9::3].min()), 0.0)
+        step = away + np.sqrt(height / self.model.g) * excess
+        step *= max(0.0, 1 - self.config.stride * height / max(float(np.linalg.norm(step)), 1e-9))
+        for c in self._feet:
+            task.q_ref[:, 7 + 3 * c : 9 + 3 * c] += step
+
     def _new_iterate(self) -> Iterate:
         task = self._task
         return Iterate.at(task.q_ref, task.v_ref, task.u_ref, C=self.model.C, M=constraints.number(self._body))
@@ -179,6 +198,7 @@ class Mpc:
         if c.mpc_model == "lcp":
             self._linearize(first)
         task.q_ref[:, 9::3] += shift
+        self._catch(q, v)
         last = self._plan
         it = self._new_iterate()
         if last is not None:

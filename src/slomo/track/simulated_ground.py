@@ -9,6 +9,7 @@ import numpy as np
 from slomo.terrain import HeightField, Slope, Terrain
 
 DEPTH = 1.0  # m, how thick slopes and height fields are below their lowest point
+FINER = 4  # times as many points of a height field
 FAR = 1000.0  # m, where the ground ends if it has a hole
 
 
@@ -46,8 +47,11 @@ def add_ground(spec: mujoco.MjSpec, terrain: Terrain, *, friction: float, **geom
 
 
 def _add_field(spec: mujoco.MjSpec, field: HeightField, common: dict[str, Any]) -> None:
-    z = np.array(field.z)
-    half = field.spacing * (np.array(z.shape) - 1) / 2
+    # MuJoCo has two triangles between four points, a terrain's surface is bilinear: on finer points they are alike.
+    rows, columns = (FINER * (n - 1) + 1 for n in np.shape(field.z))
+    grid = np.stack(np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"), axis=-1) * field.spacing / FINER
+    z, _, _ = field.sample(grid * (1 - 1e-12) + [field.x_min, field.y_min])
+    half = field.spacing / FINER * (np.array(z.shape) - 1) / 2
     # MuJoCo scales the heights to 0..1 of the size's third number; a flat field needs some.
     spec.add_hfield(
         name="field", nrow=z.shape[1], ncol=z.shape[0], userdata=(z.T - z.min()).ravel(),

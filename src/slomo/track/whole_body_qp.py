@@ -48,6 +48,7 @@ class QpConfig:
         loaded: share of the weight above which a planned force makes a contact.
         near: m over the ground, up to which a foot can be in contact.
         margin: s, within which a joint may come to a stop at its limit.
+        hold: s, after which the motor PD's targets are where the accelerations lead.
         frequency: rad/s, and damping: of the motor PD of a joint alone: kp = I w^2, kd = 2 damping I w.
     """
 
@@ -64,10 +65,12 @@ class QpConfig:
     posture_kp: float = 100.0
     posture_kd: float = 20.0
     force: float = 1e-3
+    balance: float = 0.5
     loaded: float = 0.02
     near: float = 0.012
     still: float = 0.1
     margin: float = 0.05
+    hold: float = 0.01
     frequency: float = 20.0
     damping: float = 1.0
 
@@ -100,11 +103,13 @@ class WholeBodyQp:
         self.body = FloatingBase(robot, robot.rotor_inertia)
         self.model = PointFootModel.from_robot(robot)
         self.posture = Posture(robot, reference)
+        self._reference = reference
         self._base = robot.model.getFrameId(robot.base)
         self._points = [robot.model.getFrameId(name) for name in robot.foot_names]
         self._hand = np.array([limb.is_hand for limb in robot.limbs])
         self._contacts = contact_points(robot)
         self._soles = [(p, self._across(*p)) for p in robot.pairs]
+        self._determined = len(robot.joint_names) == 3 * len(robot.limbs)
         self._raise = np.array([0.0, 0.0, robot.foot_radius])
         data = self.body.model.createData()
         inertia = np.diag(pin.crba(self.body.model, data, robot.q_nominal))[6:]
@@ -116,6 +121,7 @@ class WholeBodyQp:
     def reset(self) -> None:
         """Forget the last torques."""
         self._tau = np.zeros(len(self.robot.effort))
+        self._acceleration = np.zeros_like(self._tau)
         self.failures = 0
 
     def _across(self, toe: int, heel: int) -> Array:
@@ -133,13 +139,27 @@ class WholeBodyQp:
             u: (C, 3) N, world, forces of the feet on the body, with feedback.
             q: (nq,) and v: (nv,), the whole robot in Pinocchio's convention.
         """
-        tau = self._solve(now, ahead, u, q, v)
-        if tau is None:
+        if not self._solve(now, ahead, u, q, v):
             self.failures += 1
+        if self._determined:
+            joints, speeds = self.posture.towards(ahead)
         else:
-            self._tau = tau
-        joints, speeds = self.posture.towards(ahead)
+            h, a = self.config.hold, self._acceleration
+            joints, speeds = q[7:] + h * v[6:] + h * h / 2 * a, v[6:] + h * a
         return JointCommand(joints, speeds, self._tau, self.kp, self.kd)
+
+    def _balance(self, t: float, position: Array, velocity: Array) -> Array:
+        """(2,) m/s^2, what a sole's width can do for the balance, of which a plan with feet without width knows nothing.
+
+        Feedback of the divergent component of motion x + v / w (Takenaka 2009; Englsberger 2015), with w^2 = g / height,
+        towards the reference's.
+        """
+        r, k = self._reference, int(np.clip(np.searchsorted(self._reference.t, t) - 1, 0, len(self._reference.t) - 2))
+        s = (t - r.t[k]) / (r.t[k + 1] - r.t[k])
+        wanted = (1 - s) * r.q[k, :2] + s * r.q[k + 1, :2]
+        w = np.sqrt(self.model.g / self.robot.standing_height)
+        ahead = position[:2] - wanted + (velocity[:2] - r.v[k + 1, :2]) / w
+        return -self.config.balance * w * w * ahead
 
     def _carried(self) -> Array:
         """(nj,) bool: joints of the trunk, which carry more than one limb."""
@@ -147,7 +167,7 @@ class WholeBodyQp:
         ends = {model.frames[f].parentJoint for f in self._points}
         return np.array([sum(j in model.supports[end] for end in ends) > 1 for j in range(2, model.njoints)])
 
-    def _solve(self, now: PlanPoint, ahead: PlanPoint, u: Array, q: Array, v: Array) -> Array | None:
+    def _solve(self, now: PlanPoint, ahead: PlanPoint, u: Array, q: Array, v: Array) -> bool:
         c, body = self.config, self.body
         body.update(q, v)
         weight = self.robot.mass * self.model.g
@@ -169,6 +189,7 @@ class WholeBodyQp:
         omega = R.T @ body.velocity(self._base)[3:]
         inertia = self.model.inertia
         linear = u.sum(axis=0) / self.model.mass - [0, 0, self.model.g]
+        linear[:2] += self._balance(now.t, T_world_base.translation, body.velocity(self._base))
         angular = R @ np.linalg.solve(inertia, R.T @ np.cross(arms, u).sum(axis=0) - np.cross(omega, inertia @ omega))
         want = np.concatenate([linear, angular]) - body.drift(self._base)
         rows.append((body.jacobian(self._base), want, np.repeat([c.body, c.turn], 3)))
@@ -227,13 +248,14 @@ class WholeBodyQp:
         try:
             x, _, flag, _ = daqp.solve(H, f0, np.vstack([T, cone]), high, low, sense)
         except ValueError:
-            return None
+            return False
         if flag not in SOLVED or not np.all(np.isfinite(x)):
-            return None
+            return False
         self.solution = dict(
             a=a0 + A @ x, f=x[nj:].reshape(-1, 3), contacts=contacts, a_err=(J @ (a0 + A @ x) - self._w0)[:6]
         )
-        return np.clip(t0 + T @ x, weakest, strongest)
+        self._tau, self._acceleration = np.clip(t0 + T @ x, weakest, strongest), x[:nj]
+        return True
 
     def _friction(self, contacts, ground: Array, nj: int) -> Array:
         """(5 K, n) rows that are not negative for forces within the pyramids about the ground's normals."""
