@@ -1,5 +1,6 @@
 """Real sockets, real processes, a log that outlives them."""
 
+import multiprocessing
 import os
 import signal
 import socket
@@ -18,6 +19,8 @@ from slomo.deploy.go1 import Go1
 from slomo.deploy.link import UdpLink, is_loopback, resolve
 from slomo.deploy.log import HEADER, RECORD, SENT, Log, read
 from slomo.deploy.run import check_way
+from slomo.deploy.stops import Stops
+from slomo.deploy.supervisor import Cause
 from slomo.deploy.twin import RELEASE, serve
 from slomo.errors import InvalidData, SlomoError, UsageError
 from slomo.track.sensors import SensorSample
@@ -210,6 +213,19 @@ def test_a_controller_that_cannot_start_says_why():
         OwnProcess(broken, realtime=False)
 
 
+def slow():
+    time.sleep(60)
+
+
+def test_a_controller_that_is_still_compiling_can_be_given_up():
+    def stop():
+        raise SlomoError("stopped")
+
+    with pytest.raises(SlomoError, match="stopped"):
+        OwnProcess(slow, realtime=False, waiting=stop)
+    assert not [child for child in multiprocessing.active_children() if child.name.startswith("SpawnProcess")]
+
+
 def header_and(count, path, **more):
     log = Log(path, {"name": "x"}, **more)
     for k in range(count):
@@ -247,6 +263,20 @@ def test_what_is_no_log(tmp_path, content):
     (tmp_path / "a.log").write_bytes(content)
     with pytest.raises(InvalidData, match=r"a\.log"):
         read(tmp_path / "a.log")
+
+
+def test_any_key_at_the_terminal_stops(monkeypatch):
+    ours, theirs = os.openpty()
+    with os.fdopen(theirs) as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        with Stops() as stops:
+            assert stops.terminal
+            assert stops() is None
+            os.write(ours, b" ")  # no need for Enter
+            cause, detail = stops() or ("", "")
+            assert cause == Cause.STOP_KEY
+            assert "' '" in detail
+    os.close(ours)
 
 
 RUNS = """

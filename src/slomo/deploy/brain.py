@@ -148,25 +148,41 @@ class OwnProcess:
     Args:
         make: makes the brain there; a top-level function, or a `Task`'s.
         realtime: ask the system to run it before ordinary processes.
+        waiting: called again and again until it is ready; may raise.
 
     Raises:
         SlomoError: it did not get ready.
     """
 
-    def __init__(self, make: Callable[..., Brain], *args, realtime: bool = True):
+    def __init__(
+        self,
+        make: Callable[..., Brain],
+        *args,
+        realtime: bool = True,
+        waiting: Callable[[], None] = lambda: None,
+    ):
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, make, args, realtime), daemon=True)
         self._process.start()
         theirs.close()
-        if not self._pipe.poll(READY_SECONDS):
-            self.close()
-            raise SlomoError(f"not ready after {READY_SECONDS:.0f} s", where="controller")
         try:
-            self.motion: Motion = self._receive()
+            self.motion = self._wait(waiting)
+        except BaseException:
+            self.close()
+            raise
+        self._asked = -np.inf
+
+    def _wait(self, waiting: Callable[[], None]) -> Motion:
+        until = time.monotonic() + READY_SECONDS
+        while not self._pipe.poll(0.1):
+            waiting()
+            if time.monotonic() > until:
+                raise SlomoError(f"not ready after {READY_SECONDS:.0f} s", where="controller")
+        try:
+            return self._receive()
         except Died as e:
             raise SlomoError(f"did not start: {e}", where="controller") from None
-        self._asked = -np.inf
 
     @property
     def pid(self) -> int | None:
@@ -187,7 +203,7 @@ class OwnProcess:
 
     def close(self) -> None:
         self._pipe.close()
-        self._process.join(1)
+        self._process.join(0.2)
         if self._process.is_alive():
             self._process.kill()
             self._process.join()

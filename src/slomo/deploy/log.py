@@ -22,7 +22,7 @@ Array = np.ndarray
 
 HEADER = 1 << 16
 MAGIC = "slomo deploy log 1"
-SECONDS = 600  # that it holds; what is older is overwritten. The file is sparse: it takes what was written
+SECONDS = 180  # that it holds; what is older is overwritten
 NJ, C = 12, 4
 
 RECORD = np.dtype(
@@ -86,8 +86,9 @@ class Log:
             path.parent.mkdir(parents=True, exist_ok=True)
             with open(path, "xb+") as f:
                 f.write(text.ljust(HEADER))
-                f.truncate(HEADER + self.capacity * RECORD.itemsize)
                 f.flush()
+                # Space is taken now: a full disk must not end the process (SIGBUS) while it holds a robot.
+                os.posix_fallocate(f.fileno(), 0, HEADER + self.capacity * RECORD.itemsize)
                 self._map = mmap.mmap(f.fileno(), 0)
         self._number = 0
         self.record = np.zeros((), RECORD)

@@ -4,6 +4,7 @@ import contextlib
 import gc
 import multiprocessing
 import os
+import signal
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -24,7 +25,7 @@ from slomo.deploy.postures import STEP, Postures
 from slomo.deploy.stops import Stops
 from slomo.deploy.twin import Twin, TwinConfig, serve
 from slomo.deploy.virtual import VirtualLink
-from slomo.errors import SlomoError, UsageError
+from slomo.errors import Interrupted, SlomoError, UsageError
 from slomo.motion import Reference
 from slomo.robot import Robot, load_robot
 from slomo.store import plain
@@ -112,17 +113,26 @@ def perform(plan: Plan, way: Way, path: Path, *, stops: Stops, say: Callable[[st
     """Stand up, play the motion, lie down; everything goes into the log at `path`.
 
     Raises:
-        SlomoError: something could not be started; the robot has not been told anything then.
+        SlomoError: something could not be started, or it was stopped before; the robot has not been told anything then.
     """
+
+    def go_on() -> None:
+        if why := stops():
+            what = f"stopped before the robot was told anything ({why[1]})"
+            raise Interrupted(stops.number, what) if stops.number else SlomoError(what, where="deploy")
+
     robot = load_robot(plan.robot)
     go1 = Go1(robot, scrambled=way.scrambled)
     with contextlib.ExitStack() as stack:
         say("compiling the controller")
         virtual = way.dry and way.transport == "twin"
-        brain: Brain = InProcess(plan.task) if virtual else OwnProcess(InProcess, plan.task, realtime=way.realtime)
+        brain: Brain = (
+            InProcess(plan.task) if virtual else OwnProcess(InProcess, plan.task, realtime=way.realtime, waiting=go_on)
+        )
         stack.callback(brain.close)
         link, clock = _reach(plan, way, robot, stack, say, virtual=virtual)
         stack.callback(link.close)
+        go_on()
         priority = stack.enter_context(_priority(way.realtime and not virtual))
         header = {
             "started": time.time(), "transport": way.transport, "address": f"{way.address}:{way.port}",
@@ -182,8 +192,6 @@ def own_twin(plan: Plan, way: Way) -> Iterator[None]:
 
 
 def _twin(plan: Plan, way: Way, ready: Any, parent: int) -> None:
-    import signal
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     robot = load_robot(plan.robot)
     twin = Twin(robot, plan.world, lying(plan, robot), config=TwinConfig(), scrambled=way.scrambled)
