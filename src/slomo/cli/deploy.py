@@ -13,6 +13,8 @@ from slomo.errors import Interrupted, MissingInput, UsageError
 PortOption = Annotated[int, typer.Option(min=0, max=65535, help="UDP port of the robot or the twin.")]
 ScrambledOption = Annotated[bool, typer.Option("--scrambled", help="The check sum is scrambled, see docs/deploy.md.")]
 
+RealtimeOption = Annotated[bool, typer.Option(help="Ask the system for priority.")]
+
 
 def add_commands(app: typer.Typer) -> None:
     """Register the commands with `app`."""
@@ -30,7 +32,7 @@ def add_commands(app: typer.Typer) -> None:
         yes: Annotated[bool, typer.Option("--yes", help="The address is right; do not ask.")] = False,
         dry_run: Annotated[bool, typer.Option("--dry-run", help="Compute and log everything, send nothing.")] = False,
         scrambled: ScrambledOption = False,
-        realtime: Annotated[bool, typer.Option(help="Ask the system for priority.")] = True,
+        realtime: RealtimeOption = True,
         from_log: Annotated[
             Path | None, typer.Option("--from-log", help="Run nothing; make the artifact from this log.")
         ] = None,
@@ -83,6 +85,7 @@ def add_commands(app: typer.Typer) -> None:
         battery: Annotated[int, typer.Option(min=0, max=100, help="%, that it reports.")] = 90,
         temperature: Annotated[float, typer.Option(min=-100, max=127, help="Degrees C of the motors.")] = 35.0,
         scrambled: ScrambledOption = False,
+        realtime: RealtimeOption = True,
         seconds: Annotated[float | None, typer.Option(help="End by itself after so long.")] = None,
     ) -> None:
         """A simulated robot that speaks the robot's own UDP protocol, in real time.
@@ -95,7 +98,7 @@ def add_commands(app: typer.Typer) -> None:
         import time
 
         from slomo.deploy.link import is_loopback, resolve
-        from slomo.deploy.run import lying
+        from slomo.deploy.run import lying, priority_of
         from slomo.deploy.twin import Twin, TwinConfig, serve
         from slomo.robot import load_robot
         from slomo.terrain import Terrain
@@ -113,10 +116,11 @@ def add_commands(app: typer.Typer) -> None:
             model, plan.world if plan else Terrain(), lying(plan, model), config=config, scrambled=scrambled
         )
         end = time.monotonic() + seconds if seconds is not None else float("inf")
-        serve(
-            simulated, address, port, until=lambda: time.monotonic() > end,
-            say=lambda text: session.console.note(f"twin: {text}"),
-        )  # fmt: skip
+        with priority_of(realtime):
+            serve(
+                simulated, address, port, until=lambda: time.monotonic() > end,
+                say=lambda text: session.console.note(f"twin: {text}"),
+            )  # fmt: skip
         session.emit("", dict(simulated.counts))
 
 

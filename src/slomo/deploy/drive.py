@@ -58,7 +58,8 @@ class Drive:
         self.link, self.clock, self.brain, self.log = link, clock, brain, log
         self.config, self.stopped, self.say = config, stopped, say
         motion, postures = brain.motion, Postures(robot)
-        self.supervisor = Supervisor(robot, config, lowest=motion.lowest)
+        self._begin = self._next = clock.now()
+        self.supervisor = Supervisor(robot, config, lowest=motion.lowest, begin=self._begin)
         self.sequence = Sequence(
             config, postures.descent(motion.first), postures.descent(motion.last), motion.end - motion.start
         )
@@ -68,7 +69,6 @@ class Drive:
         self._reply: Reply | None = None
         self._held = False
         self._shift = 0.0  # s, from the driver's clock to the motion's
-        self._begin = self._next = clock.now()
         self._ticks = self._missed = 0
 
     def run(self) -> Result:

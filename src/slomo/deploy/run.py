@@ -133,7 +133,7 @@ def perform(plan: Plan, way: Way, path: Path, *, stops: Stops, say: Callable[[st
         link, clock = _reach(plan, way, robot, stack, say, virtual=virtual)
         stack.callback(link.close)
         go_on()
-        priority = stack.enter_context(_priority(way.realtime and not virtual))
+        priority = stack.enter_context(priority_of(way.realtime and not virtual))
         header = {
             "started": time.time(), "transport": way.transport, "address": f"{way.address}:{way.port}",
             "dry_run": way.dry, "priority": priority, "track": plain(plan.track), **plan.identity,
@@ -195,7 +195,7 @@ def _twin(plan: Plan, way: Way, ready: Any, parent: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     robot = load_robot(plan.robot)
     twin = Twin(robot, plan.world, lying(plan, robot), config=TwinConfig(), scrambled=way.scrambled)
-    with _priority(way.realtime):
+    with priority_of(way.realtime):
         serve(twin, LOOPBACK, way.port, until=lambda: os.getppid() != parent, say=lambda text: ready.set())
 
 
@@ -210,7 +210,7 @@ def _free(port: int) -> bool:
 
 
 @contextlib.contextmanager
-def _priority(realtime: bool) -> Iterator[str]:
+def priority_of(realtime: bool) -> Iterator[str]:
     """No garbage collection inside the block, and, if possible, priority; yields which."""
     gc.collect()
     gc.disable()

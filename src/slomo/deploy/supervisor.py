@@ -73,6 +73,7 @@ class Supervisor:
 
     Args:
         lowest: m, lowest height of the body's base in the motion.
+        begin: s, when the run begins; the times of trips count from there.
 
     Attributes:
         trip: None, or why only damping is let through.
@@ -80,8 +81,8 @@ class Supervisor:
         upright: set by the caller while the robot should be standing, when its height counts.
     """
 
-    def __init__(self, robot: Robot, config: Config, *, lowest: float):
-        self.robot, self.config = robot, config
+    def __init__(self, robot: Robot, config: Config, *, lowest: float, begin: float = 0.0):
+        self.robot, self.config, self._origin = robot, config, begin
         self.trip: Trip | None = None
         self.landing: Trip | None = None
         self.upright = self._resting = False
@@ -104,7 +105,7 @@ class Supervisor:
     def stop(self, cause: Cause, now: float, detail: str) -> None:
         """Trip. The first one stays."""
         if self.trip is None and not self._resting:
-            self.trip = Trip(cause, now, detail)
+            self.trip = Trip(cause, now - self._origin, detail)
 
     def rest(self) -> None:
         """The run is over and the robot goes down: what is seen from now on is no reason to stop it."""
@@ -218,7 +219,7 @@ class Supervisor:
 
     def _land(self, cause: Cause, now: float, detail: str) -> None:
         if self.landing is None:
-            self.landing = Trip(cause, now, detail)
+            self.landing = Trip(cause, now - self._origin, detail)
 
     def _joint(self, cause: Cause, excess: Array, x: Array, unit: str, now: float) -> None:
         worst = int(excess.argmax())
