@@ -58,11 +58,11 @@ class Drive:
         self.link, self.clock, self.brain, self.log = link, clock, brain, log
         self.config, self.stopped, self.say = config, stopped, say
         motion, postures = brain.motion, Postures(robot)
-        self._begin = self._next = clock.now()
-        self.supervisor = Supervisor(robot, config, lowest=motion.lowest, begin=self._begin)
         self.sequence = Sequence(
             config, postures.descent(motion.first), postures.descent(motion.last), motion.end - motion.start
         )
+        self._begin = self._next = clock.now()
+        self.supervisor = Supervisor(robot, config, lowest=motion.lowest, begin=self._begin)
         self._go1, self._receiver = go1, Receiver(go1)
         self._samples: list[RobotState] = []
         self._truth = np.full(7, np.nan)
