@@ -19,9 +19,9 @@ from slomo.store import plain
 from slomo.store.digest import digest_arrays
 from slomo.terrain import Terrain
 from slomo.track import metrics
+from slomo.track import stage as tracking
 from slomo.track.joint_space import JointSpace
 from slomo.track.recording import reference_at
-from slomo.track.stage import Config as TrackConfig
 
 Array = np.ndarray
 
@@ -52,7 +52,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
         )  # fmt: skip
     reference = Reference.from_arrays(upstream.npz["reference.npz"])
     digest = str(inputs.artifacts["track"].npz["rollout.npz"]["reference_digest"])
-    track = TrackConfig(**header["track"])
+    track = tracking.Config(**header["track"])
     terrain = Terrain.from_json(upstream.json["terrain.json"])
     end = float(motion_of(reference, track).t[-1])
     reference = with_approach(reference, robot, terrain=terrain, track=track, rest=config.rest)
