@@ -17,7 +17,7 @@ class Config:
         stand: s, so before the controller takes over.  blend: s, from the stand's command to the controller's.
         rest: s, after the motion's end, before the feet are set below the hips again.
         lower: s, down to a crouch.  damp: s, of damping before the end.
-        stand_kp: N m/rad, stand_kd: N m s/rad: motor PD of standing up and lying down.
+        stand_kp: N m/rad, stiffness of the motors in standing up and lying down.  stand_kd: N m s/rad, their damping.
         stale: s, age of the newest state from which the robot is damped.
         max_loss: fraction of the states of the last second that may be missing.
         hold: s, for which the last command is repeated when the controller is late; then the robot is damped.
