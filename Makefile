@@ -2,6 +2,7 @@
 # make test   unit tests and an end-to-end smoke test     make check  ruff and pyright
 # make train-prior   pictures, then the networks of src/slomo/prior/weights, from nothing: within the hour on two cores
 # make bench  the solvers of `slomo optimize` side by side, and with longer motions          (BENCH="--cap 60 --json")
+# make bench-mpc     one tick of the controller beside QP solvers and Fatrop             (BENCH="--minutes 10": memory, drift)
 # make bench-random  spoiled key points through retarget and optimize: verified, refused, or neither  (BENCH="--count 20")
 # make bench-prior   those networks alone against truth      (WEIGHTS=folder: others; BENCH="--truth ... --masks ...")
 # make bench-parts   reconstruction without each of its parts
@@ -17,7 +18,8 @@ STEPS_human     := 4000
 PRIOR  := prior-training
 SHIPPED := src/slomo/prior/weights
 
-.PHONY: demo test slow check conformance clean train-prior bench bench-random bench-prior bench-terms bench-parts $(KINDS:%=train-%)
+.PHONY: demo test slow check conformance clean train-prior bench bench-mpc bench-random bench-prior bench-terms bench-parts \
+  $(KINDS:%=train-%)
 .DELETE_ON_ERROR:
 
 demo: .venv/run.stamp
@@ -51,6 +53,9 @@ $(KINDS:%=train-%): train-%: .venv/dev.stamp
 
 bench: .venv/dev.stamp
 	OMP_NUM_THREADS=1 .venv/bin/python tests/bench_optimize.py $(BENCH)
+
+bench-mpc: .venv/dev.stamp
+	OMP_NUM_THREADS=1 .venv/bin/python tests/bench_mpc.py $(BENCH)
 
 bench-random: .venv/dev.stamp
 	OMP_NUM_THREADS=1 .venv/bin/python tests/bench_random.py $(BENCH)

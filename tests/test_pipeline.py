@@ -1,5 +1,6 @@
 """The table of stages, their keys, resumption, and two processes on one project."""
 
+import dataclasses
 import json
 import os
 import shutil
@@ -97,6 +98,8 @@ def test_a_new_projects_file_is_read_back_as_the_defaults(tmp_path):
     for name, spec in STAGES.items():
         config = spec.of_module(spec.config)
         assert settings.make(config, tables.get(name, {}), where=name) == config()
+        if spec.shares != ALL:
+            assert set(tables.get(name, {})) == {f.name for f in dataclasses.fields(config)}
 
 
 def write_inputs(root, **inputs):

@@ -122,7 +122,7 @@ def test_slippery_ground_shows():
         ({"mpc_hz": 333}, "track.mpc_hz"),
         ({"kp": 0.0}, "track.kp"),
         ({"settle": -1.0}, "track.settle"),
-        ({"horizon": 0}, "track.horizon"),
+        ({"horizon": -1}, "track.horizon"),
     ],
 )
 def test_parameters_out_of_range(config, where):
@@ -199,3 +199,66 @@ def test_errors_of_a_known_offset():
     assert e["orientation_rmse"] == pytest.approx(5)
     before = np.full_like(r.t, -1.0)
     assert metrics.errors(dataclasses.replace(r, t=before))["body_rmse"] is None
+
+
+def stepping(t, *, down, up):
+    """(T, 4, 3) N: every foot stands but for [up, down) (s) each."""
+    lam = np.zeros((len(t), 4, 3))
+    for c in range(4):
+        lam[:, c, 2] = np.where((t >= up[c]) & (t < down[c]), 0.0, 30.0)
+    return lam
+
+
+def test_contact_times_that_are_known():
+    robot = load_robot("go1")
+    reference = sway(robot)
+    planned = stepping(reference.t[:-1], up=[0.2, 0.4, 0.6, 2.0], down=[0.3, 0.5, 0.7, 2.1])
+    r = Rollout.from_arrays(swayed().npz["rollout.npz"])
+    lam = stepping(r.t, up=[0.21, 0.4, 0.6, 2.0], down=[0.3, 0.53, 0.601, 2.1])
+    lam[np.abs(r.t - 0.75) < 0.006, 3] = 0.0  # a bounce is no step
+    timing = metrics.contact_timing(dataclasses.replace(r, lam=lam), dataclasses.replace(reference, lam=planned))
+    assert timing["contact_events"] == 6
+    assert timing["contact_events_missed"] == 2  # the third foot hardly left the ground
+    assert timing["contact_timing_error"] == pytest.approx((0.01 + 0 + 0 + 0.03) / 4, abs=0.002)
+    assert timing["contact_agreement"] == pytest.approx(1 - (0.01 + 0.03 + 0.099 + 0.012) / 4, abs=0.003)
+
+
+def test_the_estimates_errors_that_are_known():
+    r = Rollout.from_arrays(swayed().npz["rollout.npz"])
+    body = r.body.copy()
+    body[:, 2] -= 0.02
+    body[r.t >= 0, 0] += 0.04 * r.t[r.t >= 0]
+    body[:, 3:] = (Rotation.from_euler("ZX", [3, 0], degrees=True) * Rotation.from_quat(body[:, 3:])).as_quat()
+    e = metrics.estimate(dataclasses.replace(r, body_est=body))
+    assert e["estimate_end"] == pytest.approx(np.hypot(0.02, 0.04), abs=1e-3)
+    assert e["estimate_height_rmse"] == pytest.approx(0.02)
+    assert e["estimate_heading_rmse"] == pytest.approx(3.0)
+    assert e["estimate_tilt_rmse"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_stand_that_every_foot_can_bear():
+    """A motion that begins beside its feet, one of them up and far ahead: the stand before it is none of that."""
+    robot = load_robot("go1")
+    model = PointFootModel.from_robot(robot)
+    reference = sway(robot)
+    q = reference.q.copy()
+    q[:, 1] += 0.12
+    q[0, 7:10] += [0.3, 0.1, 0.1]
+    whole = with_lead_in(
+        dataclasses.replace(reference, q=q),
+        model,
+        standing=robot.nominal_feet,
+        terrain=Terrain(),
+        settle=0.3,
+        blend=0.6,
+    )
+    standing = whole.points[0] - whole.q[0, :3]
+    np.testing.assert_allclose(standing[0, :2], robot.nominal_feet[0, :2], atol=0.13)
+    assert np.linalg.norm(standing[0] - model.leg_roots[0]) < model.leg_max[0]
+    lam = whole.lam[0, :, 2]
+    assert lam.sum() == pytest.approx(robot.mass * 9.81, rel=1e-6)
+    assert np.all(lam > 0.05 * robot.mass * 9.81)
+    # It comes from rest and arrives where the motion begins, without a jump.
+    n = int(np.sum(whole.t < 0))
+    assert np.abs(np.diff(whole.q[: n + 1, :3], axis=0)).max() < 0.02
+    np.testing.assert_allclose(whole.v[whole.t < -0.61, :3], 0, atol=1e-12)

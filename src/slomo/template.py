@@ -33,12 +33,17 @@ def _entries(module: str, name: str) -> list[tuple[str, Any, str]]:
         raise ModuleNotFoundError(f"no module {module}")
     source = Path(spec.origin).read_text()
     body = ast.parse(source).body
-    froms = {a.name: n.module for n in body if isinstance(n, ast.ImportFrom) for a in n.names}
+    imported = [(a, n.module) for n in body if isinstance(n, ast.ImportFrom) for a in n.names]
+    froms, modules = {a.name: m for a, m in imported}, {a.asname or a.name: f"{m}.{a.name}" for a, m in imported}
     if name in froms:
         return _entries(froms[name] or module, name)
     record = next(n for n in body if isinstance(n, ast.ClassDef) and n.name == name)
-    named = {base.id for base in record.bases if isinstance(base, ast.Name)}
-    inherited = [entry for base in named for entry in _entries(froms.get(base) or module, base)]
+    inherited = []
+    for base in record.bases:
+        if isinstance(base, ast.Name):
+            inherited += _entries(froms.get(base.id) or module, base.id)
+        elif isinstance(base, ast.Attribute) and isinstance(base.value, ast.Name):
+            inherited += _entries(modules[base.value.id], base.attr)
     fields = {
         n.target.id: n.value
         for n in record.body

@@ -1,12 +1,17 @@
 """Parameters of `slomo track`, and what they may be."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from slomo.errors import UsageError
+from slomo.pointfoot import GRAVITY
+from slomo.robot import Robot
 from slomo.track.mpc import MODELS, MpcConfig
 from slomo.track.planner import PLANNERS
 
 JOINT_HZ = 500
+HORIZON = 1.5
 STATES = ("estimated", "truth")
 LAYERS = ("auto", "ik", "qp")
 
@@ -16,6 +21,7 @@ class Config(MpcConfig):
     """Parameters of the controller and of its test in simulation; those of the MPC are those of `mpc.MpcConfig`.
 
     Attributes:
+        horizon: as in `MpcConfig`; 0: as many steps as suit the robot's height, see `resolved`.
         controller: "ci-mpc"; for comparison "convex-mpc" (contact schedule of the reference, see `convex_mpc`) or
             "open-loop" (see `open_loop`).
         state: what the controller knows: "estimated" from joint encoders and IMU, or "truth", for study.
@@ -31,6 +37,7 @@ class Config(MpcConfig):
         blend: s, gathering the first pose's velocity.
     """
 
+    horizon: int = 0
     controller: str = "ci-mpc"
     state: str = "estimated"
     joint_layer: str = "auto"
@@ -42,6 +49,14 @@ class Config(MpcConfig):
     command_delay: float = 0.002
     settle: float = 0.3
     blend: float = 0.6
+
+
+def resolved(config: Config, robot: Robot) -> Config:
+    """With a horizon. Tall robots fall more slowly: it lasts `HORIZON` times sqrt(height / g), which is 10 steps of
+    25 ms on a Go1."""
+    if config.horizon:
+        return config
+    return replace(config, horizon=round(HORIZON * np.sqrt(robot.standing_height / GRAVITY) / config.dt))
 
 
 def layer_of(config: Config, kind: str) -> str:
@@ -57,9 +72,9 @@ def check(config: Config) -> None:
     for name, valid in choices:
         if getattr(config, name) not in valid:
             raise UsageError(f"{getattr(config, name)!r}", where=f"track.{name}", valid=valid)
-    for name in ("horizon", "dt", "iterations", "mu", "kappa", "kp", "friction", "blend"):
+    for name in ("dt", "iterations", "mu", "kappa", "kp", "friction", "blend"):
         if not getattr(config, name) > 0:
             raise UsageError(f"needs a number above 0, got {getattr(config, name)}", where=f"track.{name}")
-    for name in ("kd", "lookahead", "command_delay", "settle"):
+    for name in ("horizon", "kd", "lookahead", "command_delay", "settle"):
         if not getattr(config, name) >= 0:
             raise UsageError(f"needs a number of at least 0, got {getattr(config, name)}", where=f"track.{name}")

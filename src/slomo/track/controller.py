@@ -6,7 +6,7 @@ from slomo.motion import Reference
 from slomo.pointfoot import PointFootModel
 from slomo.robot import Robot
 from slomo.terrain import Terrain
-from slomo.track.config import Config, layer_of
+from slomo.track.config import Config, layer_of, resolved
 from slomo.track.estimator import Estimator
 from slomo.track.joint_space import JointCommand, JointSpace
 from slomo.track.lead_in import with_lead_in
@@ -48,6 +48,7 @@ class Controller:
         terrain: Terrain,
         config: Config,
     ):
+        config = resolved(config, robot)
         model = PointFootModel.from_robot(robot, mu=config.mu)
         self.robot, self.config, self.terrain = robot, config, terrain
         self.reference = with_lead_in(

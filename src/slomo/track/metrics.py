@@ -105,8 +105,8 @@ def _events(t: Array, stands: Array) -> list[tuple[float, bool]]:
     """Times at which a foot's state (T,) changes, and to what; states that last less than `BOUNCE` are no changes."""
     edges = np.flatnonzero(np.diff(stands)) + 1
     out: list[tuple[float, bool]] = []
-    for i, after in zip(edges, [*edges[1:], None], strict=True):
-        lasts = after is None or t[after] - t[i] >= BOUNCE
+    for k, i in enumerate(edges):
+        lasts = k + 1 == len(edges) or t[edges[k + 1]] - t[i] >= BOUNCE
         if lasts and stands[i] != (out[-1][1] if out else stands[0]):
             out.append((float(t[i]), bool(stands[i])))
     return out

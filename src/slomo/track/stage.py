@@ -13,7 +13,7 @@ from slomo.stage import Arrays, Artifact, Inputs, Progress
 from slomo.terrain import Terrain
 from slomo.track import config as controller
 from slomo.track import metrics
-from slomo.track.config import layer_of
+from slomo.track.config import layer_of, resolved
 from slomo.track.cyclic import repeated
 from slomo.track.disturbance import Disturbance, Push
 from slomo.track.loop import simulate
@@ -117,7 +117,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
 def _method(config: Config, robot: Robot) -> str:
     """In words, what ran."""
     layers = {"ik": "inverse kinematics + PD + J^T forces", "qp": "whole-body QP + PD"}
-    planner = f"{config.controller} (H = {config.horizon}, {config.mpc_hz} Hz)"
+    planner = f"{config.controller} (H = {resolved(config, robot).horizon}, {config.mpc_hz} Hz)"
     return f"{planner}, {layers[layer_of(config, robot.kind)]}, {config.state} state, MuJoCo"
 
 
