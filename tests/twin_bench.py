@@ -80,7 +80,7 @@ def new_twin(**config):
 
 
 def run(tmp_path: Path, *, do=lambda link: None, at=FAULT, brain=None, config=QUICK, stopped=lambda: None, **channels):
-    """One run in which `do(link)` happens at `at`. Returns the link, the result (or the exception) and the log's path."""
+    """One run in which `do(link)` happens at `at`. Returns link, result (or exception), drive and log."""
     link = Watched(new_twin(), at=at, do=do, **channels)
     path = tmp_path / "run.log"
     log = Log(path, {}, seconds=10)
