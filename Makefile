@@ -7,6 +7,7 @@
 # make bench-prior   those networks, alone and over a clip, against truth      (WEIGHTS=folder: others; BENCH="--truth ... --projects ...")
 # make bench-parts   reconstruction without each of its parts
 # make bench-terms   reconstruction with and without each term of the prior   (BENCH="--seeds 5 --terms some")
+# make conformance   the robot's wire format against its vendor's own SDK, on loopback; skipped where pip has no such SDK
 PYTHON ?= python3
 ROBOT  ?= go1
 DEMO   := demo
@@ -17,7 +18,8 @@ STEPS_human     := 4000
 PRIOR  := prior-training
 SHIPPED := src/slomo/prior/weights
 
-.PHONY: demo test slow check clean train-prior bench bench-mpc bench-random bench-prior bench-terms bench-parts $(KINDS:%=train-%)
+.PHONY: demo test slow check conformance clean train-prior bench bench-mpc bench-random bench-prior bench-terms bench-parts \
+  $(KINDS:%=train-%)
 .DELETE_ON_ERROR:
 
 demo: .venv/run.stamp
@@ -33,6 +35,10 @@ check: .venv/dev.stamp
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/pyright
+
+conformance: .venv/dev.stamp
+	-.venv/bin/pip install --quiet --disable-pip-version-check --no-deps unitree-legged-sdk
+	.venv/bin/python -m pytest tests/conformance_go1.py || test $$? -eq 5  # 5: skipped
 
 # One kind a core; stopped at any time, the same command goes on.
 train-prior: .venv/dev.stamp

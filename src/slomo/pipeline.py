@@ -105,6 +105,9 @@ STAGES: dict[str, StageSpec] = {
             "track", "slomo.track.stage", "track --sim", upstream=("optimize",), optional=("world",), robot=True
         ),
         StageSpec(
+            "deploy", "slomo.deploy.stage", "deploy", upstream=("optimize", "track"), files=("deploy_log",), robot=True
+        ),
+        StageSpec(
             "trials", "slomo.track.trials", "track --trials", upstream=("optimize",), robot=True, shares=ALL,
             lender="track",
         ),
@@ -253,9 +256,8 @@ class Project:
         found = {role: path for role in (*spec.files, *spec.optional) if (path := self.given(role))}
         for role in spec.files:
             if role not in found:
-                raise MissingInput(
-                    f"no {role} given", where=self.root, todo=f"run `slomo {spec.command} {role.upper()}`"
-                )
+                command = self.command(stage) if spec.robot else f"slomo {spec.command} {role.upper()}"
+                raise MissingInput(f"no {role} given", where=self.root, todo=f"run `{command}`")
         if "weights" in spec.optional:
             self._choose_masks(found, self.tables.get(stage, {}).get("segmenter", "auto"))
         if "prior" in spec.optional:

@@ -28,6 +28,7 @@ INPUTS = {
     "skeleton": "kinematic skeleton (.toml) instead of a built-in one",
     "keypoints": "key points that `slomo import` reads instead of a clip",
     "terrain": "ground that `slomo retarget` puts the motion on (.json), see docs/retarget.md",
+    "deploy_log": "log of the last run of `slomo deploy`",
     "world": "ground of the simulation (.json) where it is not as planned, see docs/track.md",
     "truth": "truth.npz of a rendered clip, against which the report scores the reconstruction",
     "motion": "what `slomo retarget` starts from when there are both: reconstruct or import",

@@ -55,7 +55,7 @@ def _entries(module: str, name: str) -> list[tuple[str, Any, str]]:
         if comment := lines[(value.end_lineno or 1) - 1][value.end_col_offset :].partition("#")[2].strip():
             about[field] = comment
     own = [(field, ast.literal_eval(value), about.get(field, "")) for field, value in fields.items()]
-    return inherited + own
+    return [entry for entry in inherited if entry[0] not in fields] + own
 
 
 def _described(docstring: str, fields: Mapping[str, Any]) -> dict[str, str]:

@@ -4,7 +4,7 @@ import sys
 
 import typer
 
-from slomo.cli import export, project, stages, tools, track
+from slomo.cli import deploy, export, project, stages, tools, track
 
 app = typer.Typer(
     name="slomo",
@@ -20,6 +20,7 @@ app = typer.Typer(
 stages.add_commands(app)
 track.add_commands(app)
 project.add_commands(app)
+deploy.add_commands(app)
 export.add_commands(app)
 tools.add_commands(app)
 

@@ -34,7 +34,7 @@ def _all_states(session: Session, robot: str | None) -> "dict[str, State]":
             session.console.note(str(e))
             continue
         found |= {s.label: s for s in states(own, "report").values()}
-        for extra in ("trials", "replay"):  # shown once they have been asked for
+        for extra in ("trials", "replay", "deploy"):  # shown once they have been asked for
             state = states(own, extra)[extra]
             found |= {state.label: state} if state.status != "missing" else {}
     return found

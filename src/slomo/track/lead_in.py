@@ -71,7 +71,7 @@ def with_lead_in(
     v[:, :2] -= (30 * s_body**2 * (1 - s_body) ** 2 / blend)[:, None] * aside
 
     acceleration = np.gradient(v[:, :3], h, axis=0)
-    u = np.array([_balance(model, q[k, :3], points[k], stance[k], acceleration[k]) for k in range(n)])
+    u = np.array([balance(model, q[k, :3], points[k], stance[k], acceleration[k]) for k in range(n)])
     lam = np.where(stance[..., None], u + [0, 0, model.g] * model.foot_mass[:, None], 0.0)
     return Reference(
         t=np.concatenate([reference.t[0] + t, reference.t]),
@@ -117,7 +117,7 @@ def _into_balance(model: PointFootModel, body: Array, points: Array) -> Array:
     return (w @ p - com) * mass / model.mass
 
 
-def _balance(model: PointFootModel, body: Array, points: Array, stance: Array, acceleration: Array) -> Array:
+def balance(model: PointFootModel, body: Array, points: Array, stance: Array, acceleration: Array) -> Array:
     """(C, 3) N: least forces that carry the body without turning it; feet in the air hang on it. None in flight."""
     gravity = np.array([0.0, 0.0, model.g])
     u = -np.outer(np.where(stance, 0.0, model.foot_mass), gravity)

@@ -1,0 +1,1 @@
+"""Deploy: the tracking loop on a robot, or on its twin: wire format, transport, safety supervisor, log."""
