@@ -223,6 +223,38 @@ def test_published_person():
     assert "a person, hands first" in notes
     feet = np.minimum(motion["left_ankle"], motion["right_ankle"])[:, 2]
     hands = (motion["left_wrist"] + motion["right_wrist"])[:, 2] / 2
-    # Jumping jacks: the hands go from the hips to over the head, the lower foot stays where it is.
-    assert np.ptp(feet) < 0.15 < 0.5 < np.ptp(hands)
+    # Jumping jacks: the hands go from the hips to over the head, the feet apart and together, and each side does alike.
+    assert np.ptp(hands) > 0.5
     assert motion["pelvis"][0, 2] > feet.max() + 0.5
+    assert any("unrolled" in note for note in notes)
+    apart = motion["left_ankle"] - motion["right_ankle"]
+    assert np.abs(apart[:, 2]).max() < 0.1 < 0.3 < np.ptp(np.linalg.norm(apart, axis=1))
+
+
+def person(path, roll, *, raised=0.0):
+    """A file of five points: jumping jacks of a body that rolls, or one that only raises its left leg."""
+    t = 0.1 * np.arange(60)
+    open_ = 0.3 + 0.25 * np.sin(2 * t)
+    ends = np.zeros((60, 4, 3))
+    for i, (side, up, length) in enumerate([(1, 1, 0.7), (-1, 1, 0.7), (1, -1, 0.9), (-1, -1, 0.9)]):
+        angle = np.pi - 2.4 * open_ if up > 0 else open_
+        if raised and up < 0:
+            angle = 0.3 + (raised * (1 + np.sin(2 * t)) if i == 2 else 0 * t)
+        ends[:, i, 1], ends[:, i, 2] = side * length * np.sin(angle), -length * np.cos(angle)
+    s, c = np.sin(roll * np.sin(2 * t))[:, None], np.cos(roll * np.sin(2 * t))[:, None]
+    ends[..., 1], ends[..., 2] = c * ends[..., 1] - s * ends[..., 2], s * ends[..., 1] + c * ends[..., 2]
+    root = np.tile([0.0, 0.0, 1.0], (60, 1))
+    frames = np.concatenate([root, np.zeros((60, 3)), (ends + root[:, None]).reshape(60, 12)], axis=1)
+    path.write_text(json.dumps({"FrameDuration": 0.1, "Frames": frames.tolist()}))
+    return load_keypoints(path)
+
+
+def test_roll_that_arms_and_legs_share_is_the_bodys(tmp_path):
+    straight, rolled = person(tmp_path / "a.json", 0.0), person(tmp_path / "b.json", 0.2)
+    np.testing.assert_allclose(rolled.positions, straight.positions, atol=1e-9)
+
+
+def test_roll_of_one_leg_is_its_own(tmp_path):
+    motion = person(tmp_path / "a.json", 0.0, raised=0.3)
+    assert np.ptp(motion["left_ankle"][:, 2]) > 0.1
+    assert np.ptp(motion["right_ankle"][:, 2]) < 1e-9

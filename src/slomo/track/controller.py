@@ -6,7 +6,7 @@ from slomo.motion import Reference
 from slomo.pointfoot import PointFootModel
 from slomo.robot import Robot
 from slomo.terrain import Terrain
-from slomo.track.config import Config, layer_of, resolved
+from slomo.track.config import JOINT_HZ, Config, layer_of, resolved
 from slomo.track.estimator import Estimator
 from slomo.track.joint_space import JointCommand, JointSpace
 from slomo.track.lead_in import with_lead_in
@@ -23,6 +23,7 @@ Array = np.ndarray
 FEELING, FORGETTING = 0.05, 0.3
 HIGHEST = 0.06  # m, by which the ground may be off
 STANDING = 3.0  # N, of planned force from which a point is planned to stand
+SMOOTHING = 0.005  # s, time constant
 
 
 class Controller:
@@ -100,6 +101,8 @@ class Controller:
             t: s, on the reference's clock; never less than before.
         """
         q, v = self.estimate(t)
+        if self._true is None and isinstance(self.layer, WholeBodyQp):
+            v = self._smoothed(v)
         self.point_state = q_point, v_point = self.joints.state(q, v)
         if self.plan is None or t >= self._due - 1e-6:
             self._feel_ground(q_point)
@@ -108,6 +111,13 @@ class Controller:
             self._due += period * max(1.0, np.floor((t - self._due) / period + 1e-3) + 1)
         u = self.plan.feedback(t, q_point, v_point)
         return self.layer.command(self.plan.at(t), self.plan.at(t + self.config.lookahead), u=u, q=q, v=v)
+
+    def _smoothed(self, v: Array) -> Array:
+        """v (nv,) with joint speeds through a low pass: the QP turns noise of encoders into torques at once."""
+        if self._speeds is None:
+            self._speeds = v[6:].copy()
+        self._speeds = self._speeds + (1 - np.exp(-1 / (JOINT_HZ * SMOOTHING))) * (v[6:] - self._speeds)
+        return np.concatenate([v[:6], self._speeds])
 
     def _make_layer(self) -> JointSpace | WholeBodyQp:
         """From plan to joints: the layer that the parameters name."""
@@ -131,4 +141,5 @@ class Controller:
         self.plan, self._due = None, float(self.reference.t[0])
         self.planner.reset()
         self.layer.reset()
+        self._speeds: Array | None = None
         self._true: tuple[Array, Array] | None = None

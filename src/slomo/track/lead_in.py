@@ -17,7 +17,7 @@ from slomo.terrain import Terrain
 Array = np.ndarray
 
 SWING = 0.3  # s, in which a foot that begins in the air leaves the ground
-LEAST = 0.4  # of an even share of the weight, what each foot bears in the stand
+LEAST = 0.6  # of an even share of the weight, what each foot bears in the stand
 IN_AIR = 0.005  # m, height from which a foot counts as in the air
 
 

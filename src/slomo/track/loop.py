@@ -132,8 +132,10 @@ def _stand(simulation: Simulation, controller: Controller, ground: Terrain, sens
     higher = ground.height(reference.points[0]) - terrain.height(reference.points[0])
     q[9::3] += higher
     q[2] += higher[robot.feet].mean()
-    # Four times the effort a radian: a few millimetres of sag in any robot.
-    joints = JointSpace(robot, kp=4 * robot.effort, kd=0.13 * robot.effort)
+    # Four times the effort a radian: a few millimetres of sag in any robot. Two ankles that keep a tall one from tipping
+    # over have to be stiffer than its weight times its height.
+    stiff, damped = (12, 0.25) if robot.kind == "humanoid" else (4, 0.13)
+    joints = JointSpace(robot, kp=stiff * robot.effort, kd=damped * robot.effort)
     pose = standing_pose(robot, q)
     zero = np.zeros_like(reference.points[0])
     point = PlanPoint(q[:3], q[3:7], np.zeros(3), np.zeros(3), q[7:].reshape(-1, 3), zero, zero, zero)
