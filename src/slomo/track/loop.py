@@ -132,8 +132,8 @@ def _stand(simulation: Simulation, controller: Controller, ground: Terrain, sens
     higher = ground.height(reference.points[0]) - terrain.height(reference.points[0])
     q[9::3] += higher
     q[2] += higher[robot.feet].mean()
-    # Four times the effort a radian: a few millimetres of sag in any robot. Two ankles that keep a tall one from tipping
-    # over have to be stiffer than its weight times its height.
+    # Four times the effort a radian: a few millimetres of sag in any robot. Two ankles that keep a tall one from
+    # tipping over have to be stiffer than its weight times its height.
     stiff, damped = (12, 0.25) if robot.kind == "humanoid" else (4, 0.13)
     joints = JointSpace(robot, kp=stiff * robot.effort, kd=damped * robot.effort)
     pose = standing_pose(robot, q)
