@@ -114,9 +114,8 @@ class Controller:
 
     def _smoothed(self, v: Array) -> Array:
         """v (nv,) with joint speeds through a low pass: the QP turns noise of encoders into torques at once."""
-        if self._speeds is None:
-            self._speeds = v[6:].copy()
-        self._speeds = self._speeds + (1 - np.exp(-1 / (JOINT_HZ * SMOOTHING))) * (v[6:] - self._speeds)
+        last = v[6:] if self._speeds is None else self._speeds
+        self._speeds = last + (1 - np.exp(-1 / (JOINT_HZ * SMOOTHING))) * (v[6:] - last)
         return np.concatenate([v[:6], self._speeds])
 
     def _make_layer(self) -> JointSpace | WholeBodyQp:
