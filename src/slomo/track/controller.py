@@ -115,8 +115,9 @@ class Controller:
     def _smoothed(self, v: Array) -> Array:
         """v (nv,) with joint speeds through a low pass: the QP turns noise of encoders into torques at once."""
         last = v[6:] if self._speeds is None else self._speeds
-        self._speeds = smooth = last + (1 - np.exp(-1 / (JOINT_HZ * SMOOTHING))) * (v[6:] - last)
-        return np.concatenate([v[:6], smooth])
+        speeds = last + (1 - np.exp(-1 / (JOINT_HZ * SMOOTHING))) * (v[6:] - last)
+        self._speeds = speeds
+        return np.concatenate([v[:6], speeds])
 
     def _make_layer(self) -> JointSpace | WholeBodyQp:
         """From plan to joints: the layer that the parameters name."""
