@@ -10,7 +10,6 @@ from slomo.retarget import stage as retarget
 from slomo.robot import load_robot
 from slomo.stage import Artifact, Inputs, Silent
 from slomo.terrain import Box, HeightField, Slope, Terrain
-from slomo.track.simulation import Simulation
 from walking import walk
 
 FIELD = HeightField(-1.0, -1.0, 0.5, ((0.0, 0.1, 0.05), (0.2, 0.0, 0.1), (0.0, 0.3, 0.0)))
@@ -85,5 +84,3 @@ def test_retargeting_lifts_feet_and_body_onto_it(tmp_path):
     assert b[:, feet, 2] == pytest.approx(a[:, feet, 2] + hill.height(a[:, feet]))
     with pytest.raises(UsageError, match="step"):
         retarget.run(Inputs(source, {"terrain": path}, robot), retarget.Config(step_height=0.1), Silent())
-    with pytest.raises(UsageError, match="not simulated"):
-        Simulation(robot, hill)
