@@ -34,20 +34,25 @@ BADJA = {
 }  # fmt: skip
 
 
-def read_masks(path: Path) -> np.ndarray:
-    """(T, H, W) bool."""
+def read_masks(path: Path, frames: np.ndarray) -> np.ndarray:
+    """(T, H, W) bool, in the size of the decoded frames (T, H, W, 3)."""
     with np.load(path) as z:
-        return np.unpackbits(z["packed"], axis=-1)[..., : z["shape"][2]].astype(bool)
+        masks = np.unpackbits(z["packed"], axis=-1)[..., : z["shape"][2]]
+    assert len(masks) == len(frames), f"{path}: {len(masks)} masks of {len(frames)} frames"
+    size = frames.shape[2], frames.shape[1]
+    return np.stack([cv2.resize(m, size, interpolation=cv2.INTER_NEAREST) for m in masks]).astype(bool)
 
 
-def badja(known: Labels, path: Path) -> Truth:
-    """The camel's annotations; nothing is known about its view."""
+def badja(known: Labels, path: Path, scale: float) -> Truth:
+    """The camel's annotations in pixels of the decoded frames, of which the clip's has `scale`; nothing is known about
+    its view."""
     with np.load(path) as z:
         frames, xy, visible = z["frame"], z["xy"], z["visible"]
+    place = (xy + 0.5) * scale - 0.5
     keypoints = np.full((len(frames), len(known.keypoints), 2), np.nan)
     for joint, name in BADJA.items():
         known_there = visible[:, joint] & (xy[:, joint] > 0).all(-1)
-        keypoints[:, known.keypoints.index(name)] = np.where(known_there[:, None], xy[:, joint], np.nan)
+        keypoints[:, known.keypoints.index(name)] = np.where(known_there[:, None], place[:, joint], np.nan)
     return Truth(frames, keypoints, np.full((len(frames), 3, 3), np.nan))
 
 
@@ -137,16 +142,17 @@ def main() -> None:
             print(f"{folder.name:<16}no network for {kind}")
             continue
         known, prior = labels(load_skeleton(kind)), Prior(path)
-        frames = decode(folder / "clip.mp4", max_side=4096).frames
+        clip = decode(folder / "clip.mp4")  # as the stage does, so that its pixels are the bench's
+        frames = clip.frames
         decided, estimated = evidence(options.projects / folder.name, folder / "clip.mp4", kind, path)
         sources = {"true": folder / "masks.npz", "est": estimated / "masks.npz"}
         for source, file in sources.items():
-            masks = read_masks(file)
+            masks = read_masks(file, frames)
             if (folder / "truth.npz").is_file():
                 at = np.arange(0, len(frames), options.every)
                 truth = truth_of(known, arrays, at[masks[at].any((1, 2))])
             else:
-                truth = badja(known, folder / "badja.npz")
+                truth = badja(known, folder / "badja.npz", frames.shape[2] / clip.info["source_width"])
             said, boxes, crops = predict(prior, frames, masks, truth.frames)
             got = judge(known, said, boxes, masks[truth.frames], truth)
             print(
@@ -171,7 +177,7 @@ def main() -> None:
                 ]
                 image = np.concatenate(columns, 1)
                 cv2.imwrite(str(options.pictures / f"{folder.name}-{source}.png"), image[..., ::-1])
-        got = judge_clip(known, decided, read_masks(folder / "masks.npz"), truth)
+        got = judge_clip(known, decided, read_masks(folder / "masks.npz", frames), truth)
         print(
             f"{folder.name:<16}{'clip':<6}{got['frames']:>6}{got['azimuth']:>6.2f}{'':>6}{got['azimuth_deg']:>7.1f}{'':>7}"
             f"{got['pck']:>6.2f}{got['pck_feet']:>6.2f}{got['sides']:>7.2f}"

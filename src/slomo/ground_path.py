@@ -53,6 +53,12 @@ def whittaker(y: Array, weight: Array, smoothness: float) -> Array:
     return x
 
 
+def mask_box(mask: Array) -> tuple[int, int, int, int]:
+    """First and last column and row u0, v0, u1, v1 px of a mask (H, W) bool, which must not be empty."""
+    u, v = np.flatnonzero(mask.any(0)), np.flatnonzero(mask.any(1))
+    return int(u[0]), int(v[0]), int(u[-1]), int(v[-1])
+
+
 def ground_path(
     t: Array, at: Array, K: Intrinsics, T_world_cam: Array, box: Array, *, quality: Array, empty: Array
 ) -> GroundPath:
@@ -61,7 +67,7 @@ def ground_path(
     Args:
         t: (T,) s of all frames; at: (F,) the frames with boxes.
         K: of the pictures that the boxes are in.  T_world_cam: (T, 4, 4), world z up, the ground at z = 0.
-        box: (F, 4) first and last columns and rows of the masks u0, v0, u1, v1, px.
+        box: (F, 4) px, as `mask_box` has them.
         quality: (F,) of the masks, in [0, 1].  empty: (F,) bool, frames without a subject; not all of them.
     """
     u0, v0, u1, v1 = box.T

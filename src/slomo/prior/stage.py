@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from slomo.errors import InvalidData, UsageError
-from slomo.ground_path import ground_path
+from slomo.ground_path import ground_path, mask_box
 from slomo.pinhole import Intrinsics
 from slomo.prior.crop import crop_box
 from slomo.prior.evidence import GRID, Columns, Dense, Shots, from_model, from_network, from_user
@@ -168,8 +168,7 @@ def _travel(t: Array, index: Array, masks: Array, quality: Array, camera: Arrays
         return np.full((F, BINS), 1 / BINS, np.float32)
     f = np.asarray(camera["K"], float)
     K = Intrinsics(f[0, 0], f[1, 1], f[0, 2], f[1, 2], width, height)
-    sides = [[np.flatnonzero(m.any(axis)) for axis in (0, 1)] for m in masks]
-    box = np.array([(u[0], v[0], u[-1], v[-1]) for u, v in sides], float)
+    box = np.array([mask_box(m) for m in masks], float)
     T_world_cam = np.asarray(camera["T_world_cam"], float)
     path = ground_path(t, index, K, T_world_cam, box, quality=quality, empty=np.zeros(F, bool))
     return view_of_travel(path, t, index, T_world_cam, kind)

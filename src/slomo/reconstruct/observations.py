@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from slomo.errors import InvalidData
+from slomo.ground_path import mask_box
 from slomo.pinhole import Intrinsics, ground_points
 from slomo.prior.frames import every, spread
 
@@ -107,7 +108,7 @@ def observe(
     inside = np.stack([distance(m) for m in mask])
     outside = np.stack([distance(~m) if m.any() else np.zeros((h, w), np.float32) for m in mask])
     empty = np.array([not m.any() for m in mask])
-    box = np.array([[0, 0, 0, 0] if not m.any() else _box(m) for m in mask], float)
+    box = np.array([[0, 0, 0, 0] if not m.any() else mask_box(m) for m in mask], float)
     # Thin parts (legs) are drawn as often as thick ones; background is drawn near the subject and everywhere.
     draw_in = _cumulative(m / (1 + i) for m, i in zip(mask, inside, strict=True))
     draw_out = _cumulative(_beside(m, o) for m, o in zip(mask, outside, strict=True))
@@ -121,11 +122,6 @@ def observe(
         quality=f(masks["quality"][at]) * f(~empty), box=box, empty=empty,
         flow_size=float(np.quantile(size, 0.5)) if len(size) else 1.0,
     )  # fmt: skip
-
-
-def _box(m: Array) -> tuple[int, int, int, int]:
-    u, v = np.flatnonzero(m.any(0)), np.flatnonzero(m.any(1))
-    return u[0], v[0], u[-1], v[-1]
 
 
 def _beside(mask: Array, outside: Array) -> Array:

@@ -36,13 +36,14 @@ class Outcome:
         rollout, reference: what happened, and what was to happen, with the lead-in.
         fall: None or what happened.
         torque_ratio: (T,) largest |torque asked for| / limit at each tick.
+        compile_seconds: s, before the first tick.
     """
 
     rollout: Rollout
     reference: Reference
     fall: str | None
     torque_ratio: Array
-    compile_seconds: float = 0.0
+    compile_seconds: float
 
 
 def simulate(
