@@ -23,8 +23,8 @@ from slomo.reconstruct.u2net import U2Net
 _FAST = 6.0  # px of motion that make a start no better
 _ALIKE = 0.75  # likeness from which on a piece may be the subject's
 _SURELY_ALIKE = 0.9  # the same of a piece that does not move as the subject did
-_LASTING = 10  # frames the network has seen, over which the subject's usual size is taken
-_MEMORY = 0.8  # of who is who, from one frame that the network sees to the next
+_LASTING = 30  # frames in which it was seen, over which the subject's usual size is taken
+_MEMORY = 0.93  # of who is who, from one frame to the next
 
 
 @dataclass(frozen=True)
@@ -34,14 +34,15 @@ class SaliencySegmenter:
     Attributes:
         network: the loaded network.
         choice: whom the user means.
-        every: the network runs on every n-th frame; flow fills the frames between.
+        every: the network runs on every n-th frame; flow fills the frames between. Legs and tails that it sees in some
+            frames only are better found when it sees them all.
         probes: frames seen whole at first, to find where the subject is best seen.
         margin: by which the subject's box is grown, in parts of its longer side, before cropping.
     """
 
     network: U2Net
     choice: Choice = field(default_factory=Choice)
-    every: int = 3
+    every: int = 1
     probes: int = 7
     margin: float = 0.15
     name: str = "u2netp"
@@ -53,7 +54,7 @@ class SaliencySegmenter:
         )
         motion = SharedMotion(flow)
         seed, seen, report = self._start(keys, frames, motion, lambda f: progress(0.2 * f))
-        track = _Track(self.network, frames, flow, motion, self.margin)
+        track = _Track(self.network, frames, flow, motion, self.margin, self.every)
         track.start(seed, *seen)
         for order in (keys[keys.index(seed) :], keys[: keys.index(seed) + 1][::-1]):
             track.follow(order, lambda: progress(0.2 + 0.5 * len(track.layers) / len(keys)))
@@ -139,9 +140,9 @@ class SaliencySegmenter:
 class _Track:
     """The subject through the frames that the network sees, and whoever comes near it."""
 
-    def __init__(self, network: U2Net, frames: np.ndarray, flow: Flow, motion: SharedMotion, margin: float):
+    def __init__(self, network: U2Net, frames: np.ndarray, flow: Flow, motion: SharedMotion, margin: float, every: int):
         self.network, self.frames, self.flow = network, frames, flow
-        self.motion, self.margin = motion, margin
+        self.motion, self.margin, self._lasting = motion, margin, max(1, _LASTING // every)
         self.layers: dict[int, np.ndarray] = {}  # frame -> (H, W) float16 probability
         self._who: dict[int, np.ndarray] = {}  # frame -> (H, W) int8, twentieths: 2 the subject, -3 another
         self._look = Look()
@@ -186,7 +187,7 @@ class _Track:
                 subject, others, sure = np.zeros_like(subject), others | subject, sure | subject
         if subject.any():
             x0, y0, x1, y1 = box_of(subject)
-            self._sizes = [*self._sizes[-_LASTING:], (x1 - x0, y1 - y0, float(subject.sum()))]
+            self._sizes = [*self._sizes[-self._lasting :], (x1 - x0, y1 - y0, float(subject.sum()))]
             velocity = self.motion.velocity(t, subject)
             self._velocity = velocity if velocity.any() else self._velocity
             if not others.any():
@@ -249,7 +250,8 @@ class _Track:
             for previous, k in zip([order[0], *order], order, strict=False):
                 if k != previous:
                     before = carried + self._who[previous].astype(np.float32) / 20
-                    carried = _MEMORY * np.clip(sample(before, self.flow.chain(k, previous)), -6, 6)
+                    fades = _MEMORY ** abs(k - previous)
+                    carried = fades * np.clip(sample(before, self.flow.chain(k, previous)), -6, 6)
                 total[k] += carried
         changed = 0
         for k in keys:

@@ -53,7 +53,7 @@ class MasksConfig:
     """
 
     segmenter: str = "auto"
-    network_every: int = 3
+    network_every: int = 1
     subject_at: tuple[float, ...] = ()
     subject_box: tuple[float, ...] = ()
 
