@@ -10,7 +10,6 @@ from slomo.reconstruct.instances_motion import SharedMotion, foreign
 from slomo.reconstruct.segment import (
     Masks,
     Report,
-    blend_over_time,
     box_of,
     component_at,
     frame_certainty,
@@ -19,11 +18,13 @@ from slomo.reconstruct.segment import (
 )
 from slomo.reconstruct.surroundings import give_back_surroundings
 from slomo.reconstruct.u2net import U2Net
+from slomo.reconstruct.votes import vote_over_time
 
 _FAST = 6.0  # px of motion that make a start no better
 _ALIKE = 0.75  # likeness from which on a piece may be the subject's
 _SURELY_ALIKE = 0.9  # the same of a piece that does not move as the subject did
 _LASTING = 30  # frames in which it was seen, over which the subject's usual size is taken
+_HELD = 0.4  # probability over time: thin limbs are missed more often than furniture is taken
 _MEMORY = 0.93  # of who is who, from one frame to the next
 
 
@@ -62,10 +63,10 @@ class SaliencySegmenter:
         told = track.settle_who_is_who()
         repaired = give_back_surroundings(frames, layers)
         progress(0.8)
-        probability = blend_over_time(layers, flow, lambda f: progress(0.8 + 0.15 * f))
+        probability = vote_over_time(layers, frames, flow, lambda f: progress(0.8 + 0.15 * f))
         masks, certainty = np.empty(frames.shape[:3], bool), np.zeros(T)
         for t, p in enumerate(probability):
-            pieces = components(p > 0.5, 1)
+            pieces = components(p > _HELD, 1)
             least = 0.01 * pieces[0].sum() if pieces else 0
             pieces = [c for c in pieces if c.sum() >= least and p[c].max() > 0.8]
             masks[t] = np.logical_or.reduce(pieces) if pieces else False
