@@ -187,8 +187,10 @@ def test_the_horizon_grows_with_the_robot():
     assert resolved(Config(horizon=5), robot_of("g1")).horizon == 5
 
 
-def test_a_humanoid_sways_without_falling():
-    robot = robot_of("g1")
+@pytest.mark.parametrize("name", ["g1", "atlas", "talos"])
+def test_a_humanoid_sways_without_falling(name):
+    """With the rotors of a small robot, Atlas's feet shook under motors strong enough to hold it, and it fell over."""
+    robot = robot_of(name)
     outcome = simulate(
         robot, standing(robot, seconds=0.5, sway=0.02), terrain=FLAT, config=Config(state="truth", settle=0.1),
         disturbance=Disturbance(), progress=Silent(),
