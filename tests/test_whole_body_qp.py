@@ -188,7 +188,7 @@ def test_the_horizon_grows_with_the_robot():
 
 
 def test_a_stand_arrives_however_far_the_hands_are():
-    """Half-way through its inverse kinematics TALOS had a hand 18 cm off, and with feet turned, stood on a sole's edge."""
+    """Half-way through its inverse kinematics TALOS had a hand 18 cm off, or stood on the edge of a sole."""
     robot = robot_of("talos")
     q = standing(robot).q[0]
     for c, side in ((4, 1.0), (5, -1.0)):  # up, from hanging

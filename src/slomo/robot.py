@@ -32,8 +32,8 @@ from slomo.robot_workspace import workspace
 Array = np.ndarray
 
 BASE_FRAME = "point_foot_body"
-# kg m2 per N m of effort, rotor inertia seen at a joint of which nothing is known: strong motors have heavy rotors or high
-# gears. The joints of the Go1 and the G1 have 1.2e-4 to 2.8e-4, but for small wrists.
+# kg m2 per N m of effort, rotor inertia seen at a joint of which nothing is known: strong motors have heavy rotors or
+# high gears. The joints of the Go1 and the G1 have 1.2e-4 to 2.8e-4, but for small wrists.
 ROTOR_INERTIA = 1.8e-4
 # Of the highest speed, the one up to which a motor gives all of its torque, where nothing is known: that of the Go2's
 # hips in their maker's torque-speed curve (13.5 of 30 rad/s).
