@@ -87,6 +87,16 @@ def test_rollout_is_whole_and_in_step_with_the_reference():
     assert carried == pytest.approx(robot.mass * 9.81, rel=0.03)
 
 
+def test_an_odd_number_of_milliseconds():
+    """One row more than half of them."""
+    robot, h, n = load_robot("go1"), 0.021, 14
+    r = sway(robot, seconds=n * H, shift=0.0)
+    artifact = track(dataclasses.replace(r, t=h * np.arange(n + 1), h=np.full(n, h)), robot)
+    t = artifact.npz["rollout.npz"]["t"]
+    assert len(t) == 599
+    assert t[-1] == pytest.approx(n * h - 0.001)
+
+
 def test_same_inputs_give_the_same_rollout():
     robot = load_robot("go1")
     a, b = (track(sway(robot, seconds=0.3), robot).npz["rollout.npz"] for _ in range(2))

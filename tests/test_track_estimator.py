@@ -1,5 +1,7 @@
 """State estimation: the filter's Jacobians, known answers, and a robot that is not where it is thought to be."""
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -105,6 +107,55 @@ def test_a_precise_measurement_removes_the_error_that_it_sees(measure):
     assert after < 0.02 * before
     assert np.linalg.eigvalsh(P).min() > -1e-12
     assert np.trace(P) < 1e-4 * SIZE
+
+
+def walked(seconds, state, P):
+    """The filter on legs that say what is true, of a robot that stands still while its feet take turns in the air."""
+    R, v, p, d, bias = state
+    h, up = (d - p) @ R, R.T @ [0.0, 0.0, GRAVITY]
+    noise = np.array([4e-4, 2e-2, 2e-5, 1e-3])
+    for k in range(round(seconds * 1000)):
+        swing = np.where(np.arange(N) == (k // 200) % N, 3.0, 5e-3)
+        inekf.predict(R, v, p, d, bias, P, bias[:3], up + bias[3:], np.zeros((N, 3)), 1e-3, GRAVITY, noise, swing)
+        inekf.correct_legs(R, v, p, d, bias, P, h, 2e-3)
+    return P
+
+
+def test_the_covariance_stays_symmetric():
+    """Rounding grew with the fourth power of time, and after six minutes of walking the filter broke."""
+    state = random_state(3)
+    P = walked(1.0, (state[0], np.zeros(3), *state[2:]), 1e-4 * np.eye(SIZE))
+    np.testing.assert_array_equal(P, P.T)
+    assert np.linalg.eigvalsh(P).min() > 0
+
+
+def test_heading_and_place_are_forgotten_and_nothing_else():
+    """What any measurement is compared with stays as uncertain, and in a moved world the covariance is the same."""
+    state, rng = random_state(5), np.random.default_rng(5)
+    root = rng.normal(size=(SIZE, SIZE))
+    before, P = root @ root.T, root @ root.T
+    inekf.forget_place(P, 1e-3, 1e-2)
+    np.testing.assert_array_equal(P, P.T)
+    assert P[2, 2] == pytest.approx(1e-6)
+    np.testing.assert_allclose(P[6:8, 6:8], 1e-4 * np.eye(2), atol=1e-12)
+    rows = np.zeros((3 * N + N, SIZE))
+    for c in range(N):
+        for i in range(3):
+            rows[3 * c + i, [6 + i, 9 + 3 * c + i]] = 1.0, -1.0
+        rows[3 * N + c, [0, 1, 11 + 3 * c]] = state[3][c, 1], -state[3][c, 0], 1.0
+    np.testing.assert_allclose(rows @ P @ rows.T, rows @ before @ rows.T, atol=1e-9)
+    kept = [i for i in range(SIZE) if i not in (2, *range(6, SIZE - 6, 3), *range(7, SIZE - 6, 3))]
+    np.testing.assert_array_equal(P[np.ix_(kept, kept)], before[np.ix_(kept, kept)])
+
+
+def test_a_walk_of_any_length_leaves_heading_and_place_bounded():
+    estimator = Estimator(load_robot("go1"), Terrain())
+    estimator.warm_up()
+    sample = estimator._last
+    estimator._P[2, 2] = 0.3**2  # as after minutes
+    estimator.sense(replace(sample, t=sample.t + 1e-3), np.ones(4, bool))
+    assert estimator._P[2, 2] < 0.01**2
+    assert np.linalg.eigvalsh(estimator._P).min() > 0
 
 
 def test_a_round_foot_that_rolls_takes_the_filters_point_along():

@@ -187,8 +187,24 @@ def test_the_horizon_grows_with_the_robot():
     assert resolved(Config(horizon=5), robot_of("g1")).horizon == 5
 
 
-def test_a_humanoid_sways_without_falling():
-    robot = robot_of("g1")
+def test_a_stand_arrives_however_far_the_hands_are():
+    """Half-way through its inverse kinematics TALOS had a hand 18 cm off, or stood on the edge of a sole."""
+    robot = robot_of("talos")
+    q = standing(robot).q[0]
+    for c, side in ((4, 1.0), (5, -1.0)):  # up, from hanging
+        q[7 + 3 * c : 10 + 3 * c] = q[:3] + robot.standing_height * np.array([0.0, 0.3 * side, 1.0])
+    data, pose = robot.model.createData(), standing_pose(robot, q)
+    pin.framesForwardKinematics(robot.model, data, pose)
+    points = [data.oMf[robot.model.getFrameId(name)].translation for name in robot.foot_names]
+    np.testing.assert_allclose(points, q[7:].reshape(-1, 3), atol=1e-4)
+    for p in contact_points(robot):
+        assert data.oMf[p.frame].act(p.offset)[2] == pytest.approx(0.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["g1", "atlas", "talos"])
+def test_a_humanoid_sways_without_falling(name):
+    """With the rotors of a small robot, Atlas's feet shook under motors strong enough to hold it, and it fell over."""
+    robot = robot_of(name)
     outcome = simulate(
         robot, standing(robot, seconds=0.5, sway=0.02), terrain=FLAT, config=Config(state="truth", settle=0.1),
         disturbance=Disturbance(), progress=Silent(),

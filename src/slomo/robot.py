@@ -32,8 +32,9 @@ from slomo.robot_workspace import workspace
 Array = np.ndarray
 
 BASE_FRAME = "point_foot_body"
-# kg m2, rotor inertia seen at a joint of which nothing is known: a small quadruped's (0.0045 to 0.010 on the Go1).
-ROTOR_INERTIA = 0.01
+# kg m2 per N m of effort, rotor inertia seen at a joint of which nothing is known: strong motors have heavy rotors or
+# high gears. The joints of the Go1 and the G1 have 1.2e-4 to 2.8e-4, but for small wrists.
+ROTOR_INERTIA = 1.8e-4
 # Of the highest speed, the one up to which a motor gives all of its torque, where nothing is known: that of the Go2's
 # hips in their maker's torque-speed curve (13.5 of 30 rad/s).
 KNEE = 0.45
@@ -266,8 +267,7 @@ def load_robot(name_or_path: str) -> Robot:
     lower, upper = position_limits(file, model, path)
     effort = joint_limit("effort", file.effort, model.effortLimit[6:], model, path)
     velocity = joint_limit("velocity", file.velocity, model.velocityLimit[6:], model, path)
-    rotors = np.full(len(effort), ROTOR_INERTIA)
-    rotor_inertia = joint_values("rotor_inertia", file.rotor_inertia, rotors, model, path)
+    rotor_inertia = joint_values("rotor_inertia", file.rotor_inertia, ROTOR_INERTIA * effort, model, path)
     knee_speed = np.minimum(joint_values("knee_speed", file.knee_speed, KNEE * velocity, model, path), velocity)
     note = repair_base_inertia(model)
     limbs = tuple(make_limb(section, model, urdf, path) for section in file.limbs)

@@ -23,6 +23,8 @@ Array = np.ndarray
 
 STILL = 0.05  # rad/s, joint speed under which a robot on all its feet stands still
 SLOW = 0.05  # s, over which that speed is averaged
+# rad, m: heading and place are known like this in the beginning, and counted anew once they are as uncertain as that.
+FOUND, LOST = (1e-4, 1e-4), (0.1, 1.0)
 
 
 @dataclass(frozen=True)
@@ -110,9 +112,9 @@ class Estimator:
         self._bias = np.zeros(6)
         n = 15 + 3 * N
         P = np.zeros((n, n))
-        P[:3, :3] = np.diag([tuning.tilt, tuning.tilt, 1e-4]) ** 2
+        P[:3, :3] = np.diag([tuning.tilt, tuning.tilt, FOUND[0]]) ** 2
         P[3:6, 3:6] = tuning.speed**2 * np.eye(3)
-        position = np.diag([1e-4, 1e-4, tuning.height]) ** 2
+        position = np.diag([FOUND[1], FOUND[1], tuning.height]) ** 2
         for i in range(6, 9 + 3 * N, 3):  # what is not known of the position is not known of the feet, alike
             for j in range(6, 9 + 3 * N, 3):
                 P[i : i + 3, j : j + 3] = position
@@ -161,6 +163,8 @@ class Estimator:
         for c in np.flatnonzero(stands & ~self._stands):
             self._touch_down(int(c))
         self._stands = stands
+        if self._P[2, 2] > LOST[0] ** 2 or max(self._P[6, 6], self._P[7, 7]) > LOST[1] ** 2:
+            inekf.forget_place(self._P, *FOUND)
         self._speed += dt / SLOW * (sample.v - self._speed)
         self._last = sample
 

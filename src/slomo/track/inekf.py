@@ -108,13 +108,15 @@ def predict(R, v, p, d, bias, P, gyro, acceleration, drift, dt, g, noise, foot_n
                 if k != i and Phi[i, k] != 0.0:
                     x += Phi[i, k] * P[k, j]
             T[i, j] = x
+    # Symmetric to the last bit: no measurement takes away what rounding makes asymmetric, and integrating it twice made
+    # it grow with the fourth power of time, until after six minutes it was larger than the variances.
     for i in range(n):
-        for j in range(n):
+        for j in range(i + 1):
             x = T[i, j]
             for k in range(n):
                 if k != j and Phi[j, k] != 0.0:
                     x += T[i, k] * Phi[j, k]
-            P[i, j] = x
+            P[i, j] = P[j, i] = x
     for i in range(n - 6):
         for j in range(n - 6):
             x = 0.0
@@ -213,3 +215,30 @@ def correct_height(R, v, p, d, bias, P, c, height, sigma):
     H[0], H[1], H[9 + 3 * c + 2] = d[c, 1], -d[c, 0], 1.0
     _take(P, xi, H, d[c, 2] - height, sigma * sigma)
     _remove(R, v, p, d, bias, xi)
+
+
+@compiled
+def forget_place(P, sigma_heading, sigma_place):
+    """Count errors from where the root is believed to be now: to it the world is moved and turned that is called true.
+
+    Heading and place on the ground are seen by no measurement, so estimates stay as they are, while variances that
+    would grow without end start anew from sigma_heading (rad) and sigma_place (m). To turn the world about its z axis
+    adds to xi_R alone, in this filter's error, and to move it, to xi_p and each xi_d alike: P becomes A P A^T with
+    A = I - (these directions) (these components of R and p).
+    """
+    n = P.shape[0]
+    for k, sigma in ((2, sigma_heading), (6, sigma_place), (7, sigma_place)):
+        last = 3 if k == 2 else n - 6
+        row = P[k].copy()
+        for i in range(n):
+            for j in range(i + 1):
+                moved_i = k <= i < last and (i - k) % 3 == 0
+                moved_j = k <= j < last and (j - k) % 3 == 0
+                x = P[i, j]
+                if moved_i and moved_j:
+                    x += row[k] - (row[i] + row[j]) + sigma * sigma
+                elif moved_i:
+                    x -= row[j]
+                elif moved_j:
+                    x -= row[i]
+                P[i, j] = P[j, i] = x

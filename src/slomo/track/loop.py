@@ -85,11 +85,12 @@ def simulate(
     encoder = sensors.q_bias if estimated else 0.0
     tau = _stand(simulation, controller, ground, sensors if estimated else None)
     t0, t1 = float(reference.t[0]), float(reference.t[-1])
-    recording = Recording(robot, reference, ticks=round((t1 - t0) * JOINT_HZ))
+    steps, every = round((t1 - t0) * MOTOR_HZ), MOTOR_HZ // JOINT_HZ
+    recording = Recording(robot, reference, ticks=-(-steps // every))
     joints, fall = JointSpace(robot), None
     bodies = reference_at(reference, t0 + np.arange(recording.ticks) / JOINT_HZ)[:, :3]
     wanted = bodies[:, 2] - terrain.height(bodies)
-    for k in range(round((t1 - t0) * MOTOR_HZ)):
+    for k in range(steps):
         t = t0 + k / MOTOR_HZ
         q, v = simulation.q, simulation.v
         if not estimated:
@@ -97,7 +98,7 @@ def simulate(
         else:
             sample = sensors.read(SensorSample(t, q[7:], v[6:], tau, v[3:6], simulation.acceleration))
             controller.sense(sample)
-        tick = k % (MOTOR_HZ // JOINT_HZ) == 0
+        tick = k % every == 0
         if tick:
             command = controller.command(t)
             motors.send(t, command)
@@ -110,7 +111,7 @@ def simulate(
                 controller, t=t, q=q, v=v, q_des=command.q, tau=tau, asked=asked, body=q_point[:7],
                 points=q_point[7:].reshape(-1, 3), lam=forces,
             )  # fmt: skip
-            fall = _fallen(q_point, float(wanted[k // (MOTOR_HZ // JOINT_HZ)]), ground, robot, body_down)
+            fall = _fallen(q_point, float(wanted[k // every]), ground, robot, body_down)
             if fall:
                 fall = f"{fall} at {t:.2f} s"
                 break

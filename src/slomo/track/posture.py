@@ -9,6 +9,9 @@ from slomo.track.plan import PlanPoint
 
 Array = np.ndarray
 
+ATTEMPTS = 8
+ARRIVED = 1e-5  # m, of points, and of a centimetre times a sole's tilt
+
 
 class Posture:
     """The reference's joint motion by inverse kinematics (`optimize.inverse`), between its knots.
@@ -50,6 +53,11 @@ def standing_pose(robot: Robot, q_point: Array) -> Array:
     """(nq,) the robot on the real ground with the base and the points of a point-foot configuration (7 + 3 C,)."""
     legs, nominal = Legs(robot), robot.q_nominal[7:]
     root = legs.root(q_point, np.zeros(6 + 3 * len(robot.limbs)))[:7]
-    q = np.concatenate([root, legs.solve(root, nominal, q_point[7:].reshape(-1, 3), nominal)])
+    joints = nominal
+    for _ in range(ATTEMPTS):  # a hand that is far from where it nominally is takes longer, and leaves soles tilted
+        joints = legs.solve(root, joints, q_point[7:].reshape(-1, 3), nominal)
+        if np.abs(legs.error).max() < ARRIVED:
+            break
+    q = np.concatenate([root, joints])
     q[2] += robot.foot_radius
     return q
