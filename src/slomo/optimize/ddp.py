@@ -41,7 +41,7 @@ def evaluate(body, task, kappa, it, rho, gap, w):
     for k in range(N):
         u = it.us[k]
         task_step(body, task, kappa, k, length(body, task, u, k), it.qs[k], it.vs[k], u, w.q1, w.v1, it.lam[k])
-        J += input_cost(body, task, k, it.vs[k], u, w.v1, it.lam[k], it.cone[k], rho)
+        J += input_cost(body, task, k, it.vs[k], u, w.v1, it.lam[k], it.cone[k], it.loads[k], rho)
         minus(w.q1, w.v1, it.qs[k + 1], it.vs[k + 1], gap[k])
         for i in range(gap.shape[1]):
             total += abs(gap[k, i])
@@ -109,6 +109,7 @@ def solve(body, task, kappa, it, rho, free_start, max_iterations, tolerance, clo
     nu = _LEAST_PENALTY
     copy(it.multiplier, w.trial.multiplier)
     copy(it.cone, w.trial.cone)
+    copy(it.loads, w.trial.loads)
     for i in range(it.closing.shape[0]):
         w.trial.closing[i] = it.closing[i]
     if not isfinite(J + G):

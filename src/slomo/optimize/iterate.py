@@ -13,6 +13,7 @@ class Iterate(NamedTuple):
     Attributes:
         qs: (N + 1, 7 + 3 C), vs: (N + 1, 6 + 3 C), us: (N, nu) as in `cost.Task`.  lam: (N, C, 3) N.
         multiplier: (N + 1, M) of `constraints`.  cone: (N, C) of friction cones.  closing: (nx,) of `closing.end_gap`.
+        loads: (N, J) of joint torques.
     """
 
     qs: Array
@@ -22,13 +23,14 @@ class Iterate(NamedTuple):
     multiplier: Array
     cone: Array
     closing: Array
+    loads: Array
 
     @classmethod
     def at(cls, qs: Array, vs: Array, us: Array, *, C: int, M: int) -> Self:
         """An iterate at copies of these, for C points and M constraints, with no forces and multipliers yet."""
         z, N = np.zeros, len(us)
         qs, vs, us = (np.array(x, float, order="C") for x in (qs, vs, us))
-        return cls(qs, vs, us, z((N, C, 3)), z((N + 1, M)), z((N, C)), z(12 + 6 * C))
+        return cls(qs, vs, us, z((N, C, 3)), z((N + 1, M)), z((N, C)), z(12 + 6 * C), z((N, 0)))
 
     def copy(self) -> Self:
         """A deep copy."""

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
 from scipy.spatial.transform import Rotation
 
 from slomo.motion import Reference
@@ -21,6 +20,7 @@ from slomo.optimize.cost import Task
 from slomo.optimize.cycle import close, end_shift, find_cycle
 from slomo.optimize.inverse import JointMotion, joint_motion
 from slomo.optimize.iterate import Iterate
+from slomo.optimize.load import JointLoad
 from slomo.optimize.problem import Steps, Targets, Weights
 from slomo.optimize.scale import best_scale
 from slomo.optimize.solve import Report, Settings, Solution
@@ -41,9 +41,8 @@ SOLVERS = {
 ATTEMPTS = 10
 _MISSED, _MARGIN = 1e-3, 1.3  # m from which on a miss counts, and by what factor of it a leg is made shorter
 _WEAKER, _SLOWER = 4, 1.15  # attempts with limited forces before the motion is slowed down, and by what each time
-_NEIGHBOURS = 2  # steps to either side of an overloaded one that are limited with it
 _CALMER = 4.0  # on the weight of the trunk's angular acceleration
-_TIGHTER = 0.9  # of the force that would keep a joint just within its torque limit
+_LOADED = 0.97  # of a joint's torque limit that is planned with once a joint was overloaded
 
 
 @dataclass(frozen=True)
@@ -112,7 +111,8 @@ def make_plan(
         if start is None:
             start = problem.make_start(model, want, task)
         else:
-            settings = replace(settings, kappas=settings.kappas[-2:])
+            # From a solution: other starts, which come from it too, have nothing to add.
+            settings = replace(settings, kappas=settings.kappas[-2:], starts=1)
         solution = run(legs, task, start, terrain=terrain, settings=settings, report=report)
         seconds += solution.seconds
         return solution
@@ -147,8 +147,8 @@ def make_plan(
             remedies.append("less room where joint limits kept a point back")
         if wrong & {"torque_ratio", "speed_ratio"}:
             overloaded += 1
-            task = _limit_forces(robot, joints, reference, task)
-            remedies.append("forces limited where joints were overloaded")
+            task = task._replace(load=_joint_load(robot, joints, reference))
+            remedies.append("forces limited by what joints can bear")
             if _trunk_overloaded(robot, joints):
                 task = task._replace(w_spin=_CALMER * task.w_spin)
                 remedies.append("a calmer trunk")
@@ -156,9 +156,7 @@ def make_plan(
                 # Forces alone do not help: it is the motion that asks too much.
                 slower = _SLOWER ** (overloaded - _WEAKER)
                 slow = make_task(replace(want, t=slower * want.t, v=want.v / slower), wish.steps)
-                task = slow._replace(ground=task.ground, u_low=task.u_low, u_high=task.u_high, w_spin=task.w_spin)
-                if wish.steps is not None:
-                    task.u_low[:, -1], task.u_high[:, -1] = slow.u_low[:, -1], slow.u_high[:, -1]
+                task = slow._replace(ground=task.ground, load=task.load, w_spin=task.w_spin)
                 remedies.append(f"the motion slowed down to {100 / slower:.0f} %")
         if not remedies:
             break
@@ -183,26 +181,11 @@ def _reference(robot: Robot, model: PointFootModel, task: Task, solution: Soluti
     )  # fmt: skip
 
 
-def _limit_forces(robot: Robot, joints: JointMotion, reference: Reference, task: Task) -> Task:
-    """The task with the forces of a limb scaled down around the steps where one of its joints is overloaded."""
-    ratio = np.abs(joints.tau) / robot.effort
-    model = robot.model
-    u_low, u_high = task.u_low.copy(), task.u_high.copy()
-    for c, name in enumerate(robot.foot_names):
-        chain = model.supports[model.frames[model.getFrameId(name)].parentJoint]
-        moved = [model.idx_vs[j] - 6 for j in chain if j > 1]
-        over = ratio[:, moved].max(axis=1)
-        # What is taken away from one step must not come back in the next.
-        over = np.where(over > 1.0, over, 0.0)
-        near = maximum_filter1d(over, 2 * _NEIGHBOURS + 1)
-        columns = slice(3 * c, 3 * c + 3)
-        for k in np.flatnonzero(near > 1.0):
-            # A foot in the air can push no less than its own weight: what is small is left alone.
-            there = np.abs(reference.u[max(k - _NEIGHBOURS, 0) : k + _NEIGHBOURS + 1, columns]).max(axis=0)
-            most = np.maximum(there * _TIGHTER / near[k], 0.05 * u_high[k, columns])
-            u_high[k, columns] = np.minimum(u_high[k, columns], most)
-            u_low[k, columns] = np.maximum(u_low[k, columns], -most)
-    return task._replace(u_low=u_low, u_high=u_high)
+def _joint_load(robot: Robot, joints: JointMotion, reference: Reference) -> JointLoad:
+    """The torques of all joints along a motion, over their limits, as they follow from the forces nearby."""
+    arm = -joints.jacobian.transpose(0, 2, 1) / robot.effort[:, None]
+    rest = joints.tau / robot.effort - np.einsum("kjf,kf->kj", arm, reference.u)
+    return JointLoad(np.ascontiguousarray(arm), rest, np.full(rest.shape, _LOADED))
 
 
 def _trunk_overloaded(robot: Robot, joints: JointMotion) -> bool:

@@ -78,7 +78,10 @@ def backward(body, task, kappa, it, rho, reg, free_start, w):
             transpose_times(B, VB, Quu)
             for i in range(nu):
                 Lu[i] = 0.0
-            input_derivative(body, task, k, v, u, w.v1, it.lam[k], it.cone[k], rho, A, B, w.D, Lx, Lu, Qxx, Quu, Qux)
+            cone, loads = it.cone[k], it.loads[k]
+            input_derivative(
+                body, task, k, v, u, w.v1, it.lam[k], cone, loads, rho, A, B, w.D, Lx, Lu, Qxx, Quu, Qux
+            )
             state_derivative(body, task, k, it.qs[k], it.vs[k], it.multiplier[k], rho, Lx, Qxx)
             for i in range(nu):
                 Quu[i, i] += reg * (_PROX_U if i < nf else _PROX_H)
