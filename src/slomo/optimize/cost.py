@@ -6,7 +6,7 @@
     acceleration                     w |sum_c u_c / m + g|^2 and w |(w_next - w) / h|^2 of the body
     slip                             w |s(gamma) v_next_t|^2 of each point, s = gamma / (gamma + slip_load)
     constraints                      augmented Lagrangian of `constraints`, of the friction cone of points that stick,
-                                     of joint torques, and of the end state of a cyclic motion
+                                     and of the end state of a cyclic motion; `load` and `reach` have their own
 
 The cost is (1/2) sum h w r^2 over the steps of length h, so that weights mean the same at any dt.
 """
@@ -20,7 +20,8 @@ from slomo.optimize import constraints, so3
 from slomo.optimize.contact import tangents
 from slomo.optimize.jit import compiled
 from slomo.optimize.linear_body import NONLINEAR, LinearBody
-from slomo.optimize.load import NO_LOAD, JointLoad, load_cost, load_derivative
+from slomo.optimize.load import NO_LOAD, JointLoad
+from slomo.optimize.reach import NO_REACH, Reach
 
 Array = np.ndarray
 
@@ -45,7 +46,7 @@ class Task(NamedTuple):
         cyclic: whether the end state must be the first one, turned about z and moved by `shift`.
         shift: (4,) m, m, m, rad: p_end = R_z(shift[3]) p_first + shift[:3].
         linear: the body's dynamics about the reference, or `NONLINEAR`.
-        load: limits of joint torques, or `NO_LOAD`.
+        load, reach: what the whole robot's joints bear and where they reach, or `NO_LOAD`, `NO_REACH`.
     """
 
     h: Array
@@ -66,6 +67,7 @@ class Task(NamedTuple):
     shift: Array
     linear: LinearBody = NONLINEAR
     load: JointLoad = NO_LOAD
+    reach: Reach = NO_REACH
 
 
 @compiled
@@ -134,11 +136,10 @@ def state_derivative(body, task, k, q, v, multiplier, rho, Lx, Lxx):
 
 
 @compiled
-def input_cost(body, task, k, v, u, v1, lam, multiplier, loads, rho):
+def input_cost(body, task, k, v, u, v1, lam, multiplier, rho):
     """Cost of an input in a state of velocity v.
 
-    v1 (6 + 3 C,) and lam (C, 3) are what the step gives; multiplier (C,) is of the friction cones, loads (J,) of the
-    joint torques.
+    v1 (6 + 3 C,) and lam (C, 3) are what the step gives; multiplier (C,) is of the friction cones.
     """
     C = body.hips.shape[0]
     h = u[3 * C] if u.shape[0] > 3 * C else task.h[k]
@@ -169,7 +170,7 @@ def input_cost(body, task, k, v, u, v1, lam, multiplier, loads, rho):
             J += (max(0.0, y + rho * _CONE * cone(body, task.ground[k + 1, c], lam[c])) ** 2 - y * y) / (
                 2 * rho * _CONE
             )
-    return J + load_cost(task.load, k, u, loads, rho)
+    return J
 
 
 @compiled
@@ -189,7 +190,7 @@ def cone_penalty(rho):
 
 
 @compiled
-def input_derivative(body, task, k, v, u, v1, lam, multiplier, loads, rho, A, B, D, Lx, Lu, Lxx, Luu, Lux):
+def input_derivative(body, task, k, v, u, v1, lam, multiplier, rho, A, B, D, Lx, Lu, Lxx, Luu, Lux):
     """Adds gradient and Gauss-Newton Hessian of `input_cost`; A, B, D as from `dynamics.linearize`."""
     C, nu = body.hips.shape[0], u.shape[0]
     nv = 6 + 3 * C
@@ -207,7 +208,6 @@ def input_derivative(body, task, k, v, u, v1, lam, multiplier, loads, rho, A, B,
             Lu[3 * c + i] += w * a / body.mass
             for n in range(C):
                 Luu[3 * c + i, 3 * n + i] += w / body.mass**2
-    load_derivative(task.load, k, u, loads, rho, Lu, Luu)
     _add_spin(h * task.w_spin, u[3 * C] if nu > 3 * C else h, v, v1, A, B, C, Lx, Lu, Lxx, Luu, Lux)
     # Residuals of one point depend on its position, velocity, its input, and on h where that is unknown.
     many = 10 if nu > 3 * C else 9

@@ -1,8 +1,8 @@
 """Joint torques as limits on the forces: linear in them about a motion whose torques are known.
 
-The whole robot's inverse dynamics along a motion gives the torque of every joint at every step. Nearby, what changes with
-the forces u between points and body is -J^T u, with the Jacobian J of the points by the joints; what the model does not
-know (masses of the limbs, their accelerations) stays as it is. So each torque over its limit is one linear form,
+The whole robot's inverse dynamics along a motion gives the torque of every joint at every step. Nearby, what changes
+with the forces u between points and body is -J^T u, with the Jacobian J of the points by the joints; the rest (masses
+of the limbs, their accelerations) stays as it is. So each torque over its limit is one linear form,
 
     |arm . u + rest| <= most,
 
@@ -37,7 +37,7 @@ class JointLoad(NamedTuple):
 NO_LOAD = JointLoad(np.zeros((0, 0, 0)), np.zeros((0, 0)), np.zeros((0, 0)))
 
 
-def excess(load: JointLoad, us: Array) -> Array:
+def load_excess(load: JointLoad, us: Array) -> Array:
     """(N, J) by which inputs (N, nu) exceed the loads, below 0 where they do not."""
     if not load.most.size:
         return np.zeros((len(us), 0))

@@ -22,12 +22,12 @@ from slomo.optimize.inverse import JointMotion, joint_motion
 from slomo.optimize.iterate import Iterate
 from slomo.optimize.load import JointLoad
 from slomo.optimize.problem import Steps, Targets, Weights
+from slomo.optimize.reach import Reach
 from slomo.optimize.scale import best_scale
 from slomo.optimize.solve import Report, Settings, Solution
 from slomo.optimize.verify import verify
 from slomo.pointfoot import PointFootModel
 from slomo.robot import Robot
-from slomo.robot_workspace import directions
 from slomo.terrain import Terrain
 
 Array = np.ndarray
@@ -39,7 +39,8 @@ SOLVERS = {
     "ipopt": ("slomo.optimize.ipopt", "solve_ipopt", "IPOPT, complementarity constraints"),
 }
 ATTEMPTS = 10
-_MISSED, _MARGIN = 1e-3, 1.3  # m from which on a miss counts, and by what factor of it a leg is made shorter
+_MISSED, _MARGIN = 1e-3, 1e-3  # m from which on a miss counts, and by how much less than was reached is asked for
+_NEIGHBOURS = 2  # knots to either side of one that missed that are limited with it
 _WEAKER, _SLOWER = 4, 1.15  # attempts with limited forces before the motion is slowed down, and by what each time
 _CALMER = 4.0  # on the weight of the trunk's angular acceleration
 _LOADED = 0.97  # of a joint's torque limit that is planned with once a joint was overloaded
@@ -104,7 +105,7 @@ def make_plan(
         task = problem.make_task(model, want, terrain, wish.weights, steps=steps)
         return task._replace(cyclic=True, shift=end_shift(want)) if wish.cyclic else task
 
-    run, legs = _solver(wish.solver), model
+    run = _solver(wish.solver)
 
     def solve(task: Task, start: Iterate | None, settings: Settings = wish.settings) -> Solution:
         nonlocal seconds
@@ -113,7 +114,7 @@ def make_plan(
         else:
             # From a solution: other starts, which come from it too, have nothing to add.
             settings = replace(settings, kappas=settings.kappas[-2:], starts=1)
-        solution = run(legs, task, start, terrain=terrain, settings=settings, report=report)
+        solution = run(model, task, start, terrain=terrain, settings=settings, report=report)
         seconds += solution.seconds
         return solution
 
@@ -143,7 +144,9 @@ def make_plan(
             settings = replace(settings, strict=True)
             remedies.append("loaded feet made to stick")
         if "joint_miss" in wrong:
-            legs = _less_room(joints, reference, legs)
+            more = _reach(robot, joints, reference)
+            old = task.reach if task.reach.most.size else Reach(more.normal[:, :0], more.most[:, :0])
+            task = task._replace(reach=Reach(*(np.concatenate(x, axis=1) for x in zip(old, more, strict=True))))
             remedies.append("less room where joint limits kept a point back")
         if wrong & {"torque_ratio", "speed_ratio"}:
             overloaded += 1
@@ -156,7 +159,7 @@ def make_plan(
                 # Forces alone do not help: it is the motion that asks too much.
                 slower = _SLOWER ** (overloaded - _WEAKER)
                 slow = make_task(replace(want, t=slower * want.t, v=want.v / slower), wish.steps)
-                task = slow._replace(ground=task.ground, load=task.load, w_spin=task.w_spin)
+                task = slow._replace(ground=task.ground, load=task.load, reach=task.reach, w_spin=task.w_spin)
                 remedies.append(f"the motion slowed down to {100 / slower:.0f} %")
         if not remedies:
             break
@@ -202,28 +205,26 @@ def _trunk_overloaded(robot: Robot, joints: JointMotion) -> bool:
     return any(ratio[j] > 1.0 for j in range(len(ratio)) if j not in legs)
 
 
-def _less_room(joints: JointMotion, reference: Reference, model: PointFootModel) -> PointFootModel:
-    """The model with less room for a point that the joints cannot bring where the reference has it.
-
-    A point missed along its leg changes the leg's limits. One missed across it moves the half-space of its workspace
-    that looks most in that direction: the hull of what joints reach is larger than what they reach.
-    """
-    R = Rotation.from_quat(reference.q[:, 3:7])
-    leg_min, leg_max, workspace = model.leg_min.copy(), model.leg_max.copy(), model.workspace.copy()
-    normals = directions()
-    for c in range(model.C):
-        wanted, reached = (R.inv().apply(x[:, c] - reference.q[:, :3]) for x in (reference.points, joints.reached))
-        for k in np.flatnonzero(joints.miss[:, c] > _MISSED):
-            off = wanted[k] - reached[k]
-            far, near = (float(np.linalg.norm(x[k] - model.leg_roots[c])) for x in (wanted, reached))
-            if abs(far - near) > 0.7 * np.linalg.norm(off):
-                room = far + _MARGIN * (near - far)
-                middle = (model.leg_min[c] + model.leg_max[c]) / 2
-                if far > near:
-                    leg_max[c] = min(leg_max[c], max(room, (middle + model.leg_max[c]) / 2))
-                else:
-                    leg_min[c] = max(leg_min[c], min(room, (middle + model.leg_min[c]) / 2))
-            else:
-                n = int(np.argmax(normals @ off))
-                workspace[c, n] = min(workspace[c, n], normals[n] @ (wanted[k] - _MARGIN * off))
-    return replace(model, leg_max=leg_max, leg_min=leg_min, workspace=workspace)
+def _reach(robot: Robot, joints: JointMotion, reference: Reference) -> Reach:
+    """Half-spaces, one for each limb, about the places where the joints cannot bring its points."""
+    T, C = joints.miss.shape
+    feet = {c: p for p, pair in enumerate(robot.pairs) for c in pair}
+    limbs: dict[int, list[int]] = {}
+    for c in range(C):
+        limbs.setdefault(feet.get(c, C + c), []).append(c)
+    R = Rotation.from_quat(reference.q[:, 3:7]).as_matrix()
+    off, at = (
+        np.einsum("kji,kcj->kci", R, x)
+        for x in (reference.points - joints.reached, joints.reached - reference.q[:, None, :3])
+    )
+    normal, most = np.zeros((T, len(limbs), C, 3)), np.full((T, len(limbs)), np.inf)
+    for m, points in enumerate(limbs.values()):
+        missed = np.flatnonzero(joints.miss[:, points].max(axis=1) > _MISSED)
+        for k in range(T):
+            # What is taken away from one knot must not come back at the next.
+            near = missed[np.abs(missed - k) <= _NEIGHBOURS]
+            if len(near):
+                n = near[np.argmin(np.abs(near - k))]
+                normal[k, m, points] = off[n, points] / np.linalg.norm(off[n, points])
+                most[k, m] = np.sum(normal[k, m] * at[n]) - _MARGIN
+    return Reach(normal.reshape(T, len(limbs), -1), most)
