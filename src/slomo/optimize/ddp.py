@@ -50,6 +50,7 @@ def evaluate(body, task, kappa, it, rho, gap, w):
             total += abs(gap[k, i])
     for k in range(N + 1):
         J += state_cost(body, task, k, it.qs[k], it.vs[k], it.multiplier[k], rho)
+        J += load_cost(task.speed, k, it.vs[k], it.speeds[k], rho)
         J += reach_cost(task.reach, k, it.qs[k], it.beyond[k], rho)
     if task.cyclic:
         end_gap(task, it.qs[0], it.vs[0], it.qs[N], it.vs[N], w.end)
@@ -114,6 +115,7 @@ def solve(body, task, kappa, it, rho, free_start, max_iterations, tolerance, clo
     copy(it.multiplier, w.trial.multiplier)
     copy(it.cone, w.trial.cone)
     copy(it.loads, w.trial.loads)
+    copy(it.speeds, w.trial.speeds)
     copy(it.beyond, w.trial.beyond)
     for i in range(it.closing.shape[0]):
         w.trial.closing[i] = it.closing[i]

@@ -1,8 +1,8 @@
 """From targets to a reference that verifies: the solver asked for, and what is tried when the verifier objects.
 
-What the point-foot model cannot know of the whole robot comes back from the verifier: where joints would be overloaded
-the forces of that limb are limited further, where joint limits keep a foot from its place the leg is made shorter, and
-where feet creep too far they are made to stick. Nothing else is changed, each attempt is told, and the last word is the
+What the point-foot model cannot know of the whole robot comes back from the verifier (`feedback`): joints' torques and
+speeds become limits on forces and velocities, places that joints do not reach half-spaces for a limb's points, and feet
+that creep too far are made to stick. Nothing else is changed, each attempt is told, and the last word is the
 verifier's.
 """
 
@@ -11,16 +11,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from slomo.motion import Reference
-from slomo.optimize import problem
+from slomo.optimize import feedback, problem
 from slomo.optimize.check import Check
 from slomo.optimize.cost import Task
 from slomo.optimize.cycle import close, end_shift, find_cycle
-from slomo.optimize.inverse import JointMotion, joint_motion
+from slomo.optimize.inverse import joint_motion
 from slomo.optimize.iterate import Iterate
-from slomo.optimize.load import JointLoad
 from slomo.optimize.problem import Steps, Targets, Weights
 from slomo.optimize.reach import Reach
 from slomo.optimize.scale import best_scale
@@ -39,11 +37,8 @@ SOLVERS = {
     "ipopt": ("slomo.optimize.ipopt", "solve_ipopt", "IPOPT, complementarity constraints"),
 }
 ATTEMPTS = 10
-_MISSED, _MARGIN = 1e-3, 1e-3  # m from which on a miss counts, and by how much less than was reached is asked for
-_NEIGHBOURS = 2  # knots to either side of one that missed that are limited with it
 _WEAKER, _SLOWER = 4, 1.15  # attempts with limited forces before the motion is slowed down, and by what each time
 _CALMER = 4.0  # on the weight of the trunk's angular acceleration
-_LOADED = 0.97  # of a joint's torque limit that is planned with once a joint was overloaded
 
 
 @dataclass(frozen=True)
@@ -131,7 +126,8 @@ def make_plan(
     while True:
         attempts.append(f"{why}: {solution.status}, start {solution.start!r}, {solution.iterations} steps")
         reference = _reference(robot, model, task, solution)
-        checks = verify(model, reference, terrain=terrain, robot=robot, want=want)
+        joints = joint_motion(robot, reference)
+        checks = verify(model, reference, terrain=terrain, robot=robot, joints=joints, want=want)
         wrong = {name for name, c in checks.items() if not c.holds}
         # Of attempts that all fail, the one that is least wrong is kept.
         badness = sum(min(c.value / c.limit, 1e3) for c in checks.values() if not c.holds)
@@ -139,27 +135,31 @@ def make_plan(
             best = badness, reference, checks, solution
         if wish.solver != "ddp" or len(attempts) >= ATTEMPTS or not wrong:
             break
-        remedies, joints = [], joint_motion(robot, reference)
+        remedies = []
         if "slip_per_second" in wrong and not settings.strict:
             settings = replace(settings, strict=True)
             remedies.append("loaded feet made to stick")
         if "joint_miss" in wrong:
-            more = _reach(robot, joints, reference)
+            more = feedback.reach(robot, joints, reference)
             old = task.reach if task.reach.most.size else Reach(more.normal[:, :0], more.most[:, :0])
             task = task._replace(reach=Reach(*(np.concatenate(x, axis=1) for x in zip(old, more, strict=True))))
             remedies.append("less room where joint limits kept a point back")
         if wrong & {"torque_ratio", "speed_ratio"}:
             overloaded += 1
-            task = task._replace(load=_joint_load(robot, joints, reference))
-            remedies.append("forces limited by what joints can bear")
-            if _trunk_overloaded(robot, joints):
+            task = task._replace(load=feedback.torques(robot, joints, reference))
+            remedies.append("forces limited where joints were overloaded")
+            if "speed_ratio" in wrong or task.speed.most.size:
+                task = task._replace(speed=feedback.speeds(robot, joints, reference))
+                remedies.append("velocities where they were too fast")
+            if feedback.trunk_overloaded(robot, joints):
                 task = task._replace(w_spin=_CALMER * task.w_spin)
                 remedies.append("a calmer trunk")
             if overloaded > _WEAKER and not wish.cyclic:
                 # Forces alone do not help: it is the motion that asks too much.
                 slower = _SLOWER ** (overloaded - _WEAKER)
                 slow = make_task(replace(want, t=slower * want.t, v=want.v / slower), wish.steps)
-                task = slow._replace(ground=task.ground, load=task.load, reach=task.reach, w_spin=task.w_spin)
+                known = {name: getattr(task, name) for name in ("ground", "w_spin", "load", "speed", "reach")}
+                task = slow._replace(**known)
                 remedies.append(f"the motion slowed down to {100 / slower:.0f} %")
         if not remedies:
             break
@@ -182,49 +182,3 @@ def _reference(robot: Robot, model: PointFootModel, task: Task, solution: Soluti
         t=np.concatenate([[0.0], np.cumsum(h)]), h=h.copy(), q=it.qs, v=it.vs, u=it.us[:, :nf].copy(), lam=it.lam,
         point_names=robot.foot_names, robot_digest=robot.digest, cycle=task.shift if task.cyclic else np.zeros(0),
     )  # fmt: skip
-
-
-def _joint_load(robot: Robot, joints: JointMotion, reference: Reference) -> JointLoad:
-    """The torques of all joints along a motion, over their limits, as they follow from the forces nearby."""
-    arm = -joints.jacobian.transpose(0, 2, 1) / robot.effort[:, None]
-    rest = joints.tau / robot.effort - np.einsum("kjf,kf->kj", arm, reference.u)
-    return JointLoad(np.ascontiguousarray(arm), rest, np.full(rest.shape, _LOADED))
-
-
-def _trunk_overloaded(robot: Robot, joints: JointMotion) -> bool:
-    """Whether a joint is overloaded that carries no foot: then it is the trunk's acceleration that asks too much."""
-    ratio = (np.abs(joints.tau) / robot.effort).max(axis=0)
-    model = robot.model
-    legs = {
-        model.idx_vs[j] - 6
-        for c, name in enumerate(robot.foot_names)
-        if np.isfinite(robot.clearance[c])
-        for j in model.supports[model.frames[model.getFrameId(name)].parentJoint]
-        if j > 1
-    }
-    return any(ratio[j] > 1.0 for j in range(len(ratio)) if j not in legs)
-
-
-def _reach(robot: Robot, joints: JointMotion, reference: Reference) -> Reach:
-    """Half-spaces, one for each limb, about the places where the joints cannot bring its points."""
-    T, C = joints.miss.shape
-    feet = {c: p for p, pair in enumerate(robot.pairs) for c in pair}
-    limbs: dict[int, list[int]] = {}
-    for c in range(C):
-        limbs.setdefault(feet.get(c, C + c), []).append(c)
-    R = Rotation.from_quat(reference.q[:, 3:7]).as_matrix()
-    off, at = (
-        np.einsum("kji,kcj->kci", R, x)
-        for x in (reference.points - joints.reached, joints.reached - reference.q[:, None, :3])
-    )
-    normal, most = np.zeros((T, len(limbs), C, 3)), np.full((T, len(limbs)), np.inf)
-    for m, points in enumerate(limbs.values()):
-        missed = np.flatnonzero(joints.miss[:, points].max(axis=1) > _MISSED)
-        for k in range(T):
-            # What is taken away from one knot must not come back at the next.
-            near = missed[np.abs(missed - k) <= _NEIGHBOURS]
-            if len(near):
-                n = near[np.argmin(np.abs(near - k))]
-                normal[k, m, points] = off[n, points] / np.linalg.norm(off[n, points])
-                most[k, m] = np.sum(normal[k, m] * at[n]) - _MARGIN
-    return Reach(normal.reshape(T, len(limbs), -1), most)

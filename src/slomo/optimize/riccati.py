@@ -51,6 +51,7 @@ def backward(body, task, kappa, it, rho, reg, free_start, w):
         if k == N:
             state_derivative(body, task, k, it.qs[k], it.vs[k], it.multiplier[k], rho, Lx, Vxx)
             reach_derivative(task.reach, k, it.qs[k], it.beyond[k], rho, Lx, Vxx)
+            load_derivative(task.speed, k, it.vs[k], it.speeds[k], rho, Lx[nv:], Vxx[nv:, nv:])
             for i in range(nx):
                 Vx[i] = Lx[i]
             if task.cyclic:
@@ -85,6 +86,7 @@ def backward(body, task, kappa, it, rho, reg, free_start, w):
             load_derivative(task.load, k, u, it.loads[k], rho, Lu, Quu)
             state_derivative(body, task, k, it.qs[k], it.vs[k], it.multiplier[k], rho, Lx, Qxx)
             reach_derivative(task.reach, k, it.qs[k], it.beyond[k], rho, Lx, Qxx)
+            load_derivative(task.speed, k, it.vs[k], it.speeds[k], rho, Lx[nv:], Qxx[nv:, nv:])
             for i in range(nu):
                 Quu[i, i] += reg * (_PROX_U if i < nf else _PROX_H)
                 lower[i], upper[i] = task.u_low[k, i] - u[i], task.u_high[k, i] - u[i]

@@ -38,7 +38,7 @@ class Settings:
         tolerance: of the relative decrease still expected.
         penalty: 1/m^2, first penalty of the constraints.
         constraint_tolerance: m, largest violation accepted.  cone_tolerance: N, the same of a friction cone.
-        load_tolerance: the same of a joint torque over its limit.  reach_tolerance: m, of `reach`.
+        load_tolerance: the same of joint torques and speeds over their limits.  reach_tolerance: m, of `reach`.
         end_tolerance: m, rad, m/s, rad/s, of the end of a cyclic motion.
         rounds: of the augmented Lagrangian (and of moving the ground) at the last kappa.
         most_iterations: in all, from one start.
@@ -175,12 +175,13 @@ class _Multipliers:
         """New multipliers in `it`; returns the largest violation relative to its tolerance."""
         rho = self.penalty
         g, sliding, end = _violations(body, task, it)
-        over, beyond = load_excess(task.load, it.us), reach_excess(task.reach, it.qs)
+        over, fast = load_excess(task.load, it.us), load_excess(task.speed, it.vs)
+        beyond = reach_excess(task.reach, it.qs)
         equal = np.array([constraints.is_equality(body, n) for n in range(g.shape[1])], bool)
         worst = max(
             float(np.where(equal, np.abs(g), g).max(initial=0.0)) / settings.constraint_tolerance,
             float(sliding.max(initial=0.0)) / settings.cone_tolerance,
-            float(over.max(initial=0.0)) / settings.load_tolerance,
+            float(max(over.max(initial=0.0), fast.max(initial=0.0))) / settings.load_tolerance,
             float(beyond.max(initial=0.0)) / settings.reach_tolerance,
             float(np.abs(end).max(initial=0.0)) / settings.end_tolerance,
         )
@@ -188,6 +189,7 @@ class _Multipliers:
         it.multiplier[:] = np.where(equal, it.multiplier, np.maximum(it.multiplier, 0.0))
         it.cone[:] = np.where(task.stick, np.maximum(0.0, it.cone + cone_penalty(rho) * sliding), 0.0)
         it.loads[:] = np.maximum(0.0, it.loads + load_penalty(rho) * over)
+        it.speeds[:] = np.maximum(0.0, it.speeds + load_penalty(rho) * fast)
         it.beyond[:] = np.maximum(0.0, it.beyond + rho * beyond)
         if task.cyclic:
             nv = len(end) // 2
@@ -202,7 +204,8 @@ def _descend(
     model: PointFootModel, task: Task, start: Iterate, terrain: Terrain, s: Settings, report: Report
 ) -> Solution:
     """From one start through all kappas, and once more with sticking points where that is asked for."""
-    body, it = Body.of(model), start.fitting(loads=task.load.most.shape[1], beyond=task.reach.most.shape[1])
+    body, (loads, speeds, beyond) = Body.of(model), (x.most.shape[1] for x in (task.load, task.speed, task.reach))
+    it = start.fitting(loads=loads, speeds=speeds, beyond=beyond)
     work = Work.make(it, cyclic=task.cyclic)
     multipliers = _Multipliers(s.penalty)
     reg, iterations, cost, failure = 1e-3, 0, np.inf, ""
