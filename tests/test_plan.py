@@ -104,7 +104,7 @@ def test_the_trunk_is_told_from_the_legs():
 
 
 def test_a_motion_that_no_force_limit_saves_is_slowed_down_and_says_so():
-    weak = replace(ROBOT, effort=0.2 * ROBOT.effort)
+    weak = replace(ROBOT, effort=0.1 * ROBOT.effort)
     source = Artifact(npz={"keypoints.npz": trot(speed=0.8).to_arrays()}, json={"terrain.json": Terrain().to_json()})
     out = stage.run(Inputs({"retarget": source}, robot=weak), stage.Config(), Silent())
     report, r = out.json["report.json"], Reference.from_arrays(out.npz["reference.npz"])

@@ -65,17 +65,15 @@ def trunk_overloaded(robot: Robot, joints: JointMotion) -> bool:
 def reach(robot: Robot, joints: JointMotion, reference: Reference) -> Reach:
     """Half-spaces, one for each limb, about the places where the joints cannot bring its points."""
     T, C = joints.miss.shape
-    feet = {c: p for p, pair in enumerate(robot.pairs) for c in pair}
-    limbs: dict[int, list[int]] = {}
-    for c in range(C):
-        limbs.setdefault(feet.get(c, C + c), []).append(c)
+    pairs = [[int(c) for c in pair] for pair in robot.pairs]
+    limbs = pairs + [[c] for c in range(C) if c not in robot.pairs]
     R = Rotation.from_quat(reference.q[:, 3:7]).as_matrix()
     off, at = (
         np.einsum("kji,kcj->kci", R, x)
         for x in (reference.points - joints.reached, joints.reached - reference.q[:, None, :3])
     )
     normal, most = np.zeros((T, len(limbs), C, 3)), np.full((T, len(limbs)), np.inf)
-    for m, points in enumerate(limbs.values()):
+    for m, points in enumerate(limbs):
         missed = np.flatnonzero(joints.miss[:, points].max(axis=1) > _MISSED)
         for k in range(T):
             # What is taken away from one knot must not come back at the next.
