@@ -13,6 +13,8 @@ from slomo.optimize.contact import contact_derivative, contact_force, tangents
 from slomo.optimize.dense import box_qp
 from slomo.optimize.dynamics import Body
 from slomo.optimize.iterate import Iterate, Work
+from slomo.optimize.load import JointLoad, load_cost, load_derivative
+from slomo.optimize.reach import Reach, reach_cost, reach_derivative, reach_excess
 from slomo.optimize.riccati import backward
 from slomo.pointfoot import PointFootModel
 from slomo.robot_workspace import directions
@@ -265,6 +267,37 @@ def test_cost_derivatives(free_step):
         g = numerical(total, np.zeros(36 + nu), eps=1e-5)[0]
         assert np.allclose(np.concatenate([Lx, Lu]), g, atol=1e-5 * np.abs(g).max())
         H = np.block([[Lxx, Lux.T], [Lux, Luu]])
+        assert np.allclose(H, H.T)
+        assert np.linalg.eigvalsh(H)[0] > -1e-9 * np.linalg.eigvalsh(H)[-1]
+
+
+def test_derivatives_of_joint_limits_and_reach():
+    rng = np.random.default_rng(11)
+    C, J, M, rho = 4, 5, 3, 30.0
+    q, v, u = random_state(rng, C)
+    loads = [JointLoad(rng.normal(size=(1, J, n)), rng.normal(size=(1, J)), np.full((1, J), 0.3)) for n in (12, 18)]
+    for load in loads:
+        load.most[0, 2] = np.inf
+    normal = rng.normal(size=(1, M, 3 * C))
+    reach = Reach(normal / np.linalg.norm(normal, axis=2, keepdims=True), np.array([[-0.2, np.inf, 0.1]]))
+    y, z = rng.uniform(0, 2, J), rng.uniform(0, 2, M)
+    assert reach_excess(reach, q[None])[0, 0] == pytest.approx(
+        reach.normal[0, 0] @ (Rotation.from_quat(q[3:7]).inv().apply(q[7:].reshape(-1, 3) - q[:3])).ravel() + 0.2
+    )
+
+    def total(d):
+        qa, va = np.zeros(19), np.zeros(18)
+        dynamics.plus(q, v, d[:36], 1.0, qa, va)
+        of_joints = load_cost(loads[0], 0, u + d[36:], y, rho) + load_cost(loads[1], 0, va, y, rho)
+        return np.array([of_joints + reach_cost(reach, 0, qa, z, rho)])
+
+    Lx, Lxx, Lu, Luu = np.zeros(36), np.zeros((36, 36)), np.zeros(12), np.zeros((12, 12))
+    load_derivative(loads[0], 0, u, y, rho, Lu, Luu)
+    load_derivative(loads[1], 0, v, y, rho, Lx[18:], Lxx[18:, 18:])
+    reach_derivative(reach, 0, q, z, rho, Lx, Lxx)
+    g = numerical(total, np.zeros(48))[0]
+    assert np.allclose(np.concatenate([Lx, Lu]), g, atol=1e-5 * np.abs(g).max())
+    for H in (Lxx, Luu):
         assert np.allclose(H, H.T)
         assert np.linalg.eigvalsh(H)[0] > -1e-9 * np.linalg.eigvalsh(H)[-1]
 

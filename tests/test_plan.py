@@ -4,13 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from slomo.motion import Reference
-from slomo.optimize import plan, problem, stage
+from slomo.optimize import feedback, plan, stage
 from slomo.optimize.inverse import JointMotion, joint_motion
+from slomo.optimize.load import load_excess
+from slomo.optimize.reach import reach_excess
 from slomo.pointfoot import PointFootModel
 from slomo.robot import load_robot
-from slomo.robot_workspace import directions
 from slomo.stage import Artifact, Inputs, Silent
 from slomo.terrain import Terrain
 from test_optimize import MODEL, ROBOT, optimize, trot
@@ -26,60 +28,83 @@ def joints(reference) -> JointMotion:
     return joint_motion(ROBOT, reference)
 
 
-def test_forces_are_limited_around_an_overloaded_step_and_for_that_limb_only(reference, joints):
-    want = problem.targets(trot(), MODEL, Terrain(), dt=0.05)
-    task = problem.make_task(MODEL, want, Terrain(), problem.Weights())
-    tau = np.zeros_like(joints.tau)
-    j = ROBOT.joint_names.index("FL_calf_joint")
-    tau[8, j] = 2.0 * ROBOT.effort[j]
-    limited = plan._limit_forces(ROBOT, replace(joints, tau=tau), reference, task)
-    changed = np.argwhere(np.any(limited.u_high < task.u_high, axis=1)).ravel()
-    assert 8 in changed
-    assert np.all(np.abs(changed - 8) <= 2)
-    c = ROBOT.foot_names.index("FL_foot")
-    others = [i for i in range(12) if i // 3 != c]
-    assert np.array_equal(limited.u_high[:, others], task.u_high[:, others])
-    assert np.array_equal(limited.u_low, -limited.u_high)
-    assert np.all(limited.u_high > 0)
+def test_torques_and_speeds_are_exact_where_they_were_looked_at(reference, joints):
+    load, speed = feedback.torques(ROBOT, joints, reference), feedback.speeds(ROBOT, joints, reference)
+    at = load_excess(load, reference.u) + load.most, load_excess(speed, reference.v) + speed.most
+    assert at[0] == pytest.approx(np.abs(joints.tau) / ROBOT.effort)
+    assert at[1] == pytest.approx(np.abs(joints.v[:, 6:]) / ROBOT.velocity)
 
 
-def test_a_leg_that_is_missed_along_itself_gets_shorter(reference, joints):
-    c, k = 0, 5
-    root = reference.q[k, :3] + MODEL.leg_roots[c]  # the trot is level and straight
-    along = (reference.points[k, c] - root) / np.linalg.norm(reference.points[k, c] - root)
+def test_torques_and_speeds_follow_forces_and_velocities(reference, joints):
+    load, speed = feedback.torques(ROBOT, joints, reference), feedback.speeds(ROBOT, joints, reference)
+    k, c = 7, ROBOT.foot_names.index("FL_foot")
+    own = [i for i, name in enumerate(ROBOT.joint_names) if name.startswith("FL")]
+    u = reference.u.copy()
+    u[k, 3 * c : 3 * c + 3] += [3.0, -2.0, 5.0]
+    lam = reference.lam.copy()
+    lam[k, c] += [3.0, -2.0, 5.0]  # what holds the foot where it was
+    change = joint_motion(ROBOT, replace(reference, u=u, lam=lam)).tau - joints.tau
+    assert np.einsum("kjf,kf->kj", load.arm, u - reference.u) * ROBOT.effort == pytest.approx(change, abs=1e-9)
+    # A foot that moves with the body, which also turns, moves no joint; one that moves in it moves its leg's.
+    v, w = np.array([0.3, -0.2, 0.1]), np.array([0.4, 0.5, -0.6])
+    turn = Rotation.from_quat(reference.q[k, 3:7]).apply(w)
+    carried = np.concatenate([v, w, (v + np.cross(turn, reference.points[k] - reference.q[k, :3])).ravel()])
+    assert speed.arm[k] @ carried == pytest.approx(0.0, abs=1e-9)
+    carried[6 + 3 * c] += 0.1
+    moved = speed.arm[k] @ carried * ROBOT.velocity
+    assert np.all(np.abs(np.delete(moved, own)) < 1e-9)
+    assert (joints.jacobian[k] @ moved)[3 * c] == pytest.approx(0.1, abs=0.01)
+
+
+def test_where_a_foot_was_missed_its_limb_gets_less_room_and_no_other(reference, joints):
+    c, k = 1, 5
     reached, miss = reference.points.copy(), np.zeros_like(joints.miss)
-    reached[k, c] -= 0.02 * along
+    reached[k, c] -= [0.0, 0.012, 0.016]
     miss[k, c] = 0.02
-    less = plan._less_room(replace(joints, reached=reached, miss=miss), reference, MODEL)
-    assert less.leg_max[c] < MODEL.leg_max[c]
-    assert np.array_equal(np.delete(less.leg_max, c), np.delete(MODEL.leg_max, c))
-    assert np.array_equal(less.workspace, MODEL.workspace)
+    reach = feedback.reach(ROBOT, replace(joints, reached=reached, miss=miss), reference)
+    assert np.argwhere(np.isfinite(reach.most)).tolist() == [[n, c] for n in range(k - 2, k + 3)]
+    beyond = reach_excess(reach, reference.q)
+    assert beyond[k, c] == pytest.approx(0.02, abs=2e-3)
+    assert beyond[k, c] - 0.02 > 0  # a little less than what was reached
+    points = reference.q.copy()
+    points[:, 7:] = reached.reshape(len(points), -1)
+    assert reach_excess(reach, points)[k, c] == pytest.approx(beyond[k, c] - 0.02)
 
 
-def test_a_point_that_is_missed_sideways_gets_less_room_there(reference, joints):
-    c, k = 0, 5
-    reached, miss = reference.points.copy(), np.zeros_like(joints.miss)
-    reached[k, c, 1] -= 0.02
-    miss[k, c] = 0.02
-    less = plan._less_room(replace(joints, reached=reached, miss=miss), reference, MODEL)
-    n = np.flatnonzero(less.workspace[c] < MODEL.workspace[c])
-    assert len(n) == 1
-    assert directions()[n[0], 1] > 0.9
-    assert np.array_equal(less.leg_max, MODEL.leg_max)
+def test_toe_and_heel_of_a_foot_share_one_half_space():
+    robot = load_robot("g1")
+    points = np.random.default_rng(0).normal(size=(2, 6, 3))
+    q = np.column_stack([np.tile([0.0, 0, 0, 0, 0, 0, 1], (2, 1)), points.reshape(2, -1)])
+    toe, heel = robot.pairs[0]
+    reached = points.copy()
+    reached[0, toe, 2] -= 0.03
+    reached[0, heel, 2] += 0.04
+    miss = np.linalg.norm(points - reached, axis=2)
+    joints = JointMotion(*(np.zeros((1, 1)) for _ in range(6)), miss=miss, reached=reached)
+    reference = Reference(
+        t=np.array([0.0, 0.1]), h=np.array([0.1]), q=q, v=np.zeros((2, 24)), u=np.zeros((1, 18)),
+        lam=np.zeros((1, 6, 3)),
+        point_names=robot.foot_names, robot_digest=robot.digest,
+    )  # fmt: skip
+    reach = feedback.reach(robot, joints, reference)
+    assert reach.most.shape == (2, 4)
+    assert np.isfinite(reach.most[0]).sum() == 1
+    normal = reach.normal[0, np.flatnonzero(np.isfinite(reach.most[0]))[0]].reshape(6, 3)
+    assert normal[[toe, heel], 2] == pytest.approx([0.6, -0.8])
 
 
 def test_the_trunk_is_told_from_the_legs():
     robot = load_robot("g1")
-    nothing = JointMotion(*(np.zeros((1, 1)) for _ in range(5)), miss=np.zeros((1, 6)), reached=np.zeros((1, 6, 3)))
+    nothing = JointMotion(*(np.zeros((1, 1)) for _ in range(6)), miss=np.zeros((1, 6)), reached=np.zeros((1, 6, 3)))
     for name, trunk in (("waist_roll_joint", True), ("left_knee_joint", False), ("left_shoulder_roll_joint", True)):
         tau = np.zeros((1, len(robot.effort)))
         j = robot.joint_names.index(name)
         tau[0, j] = 1.1 * robot.effort[j]
-        assert plan._trunk_overloaded(robot, replace(nothing, tau=tau)) == trunk
+        assert feedback.trunk_overloaded(robot, replace(nothing, tau=tau)) == trunk
 
 
 def test_a_motion_that_no_force_limit_saves_is_slowed_down_and_says_so():
-    weak = replace(ROBOT, effort=0.3 * ROBOT.effort)
+    weak = replace(ROBOT, effort=0.1 * ROBOT.effort)
     source = Artifact(npz={"keypoints.npz": trot(speed=0.8).to_arrays()}, json={"terrain.json": Terrain().to_json()})
     out = stage.run(Inputs({"retarget": source}, robot=weak), stage.Config(), Silent())
     report, r = out.json["report.json"], Reference.from_arrays(out.npz["reference.npz"])

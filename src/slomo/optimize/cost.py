@@ -6,7 +6,7 @@
     acceleration                     w |sum_c u_c / m + g|^2 and w |(w_next - w) / h|^2 of the body
     slip                             w |s(gamma) v_next_t|^2 of each point, s = gamma / (gamma + slip_load)
     constraints                      augmented Lagrangian of `constraints`, of the friction cone of points that stick,
-                                     and of the end state of a cyclic motion
+                                     and of the end state of a cyclic motion; `load` and `reach` add theirs
 
 The cost is (1/2) sum h w r^2 over the steps of length h, so that weights mean the same at any dt.
 """
@@ -20,6 +20,8 @@ from slomo.optimize import constraints, so3
 from slomo.optimize.contact import tangents
 from slomo.optimize.jit import compiled
 from slomo.optimize.linear_body import NONLINEAR, LinearBody
+from slomo.optimize.load import NO_LOAD, JointLoad
+from slomo.optimize.reach import NO_REACH, Reach
 
 Array = np.ndarray
 
@@ -44,6 +46,8 @@ class Task(NamedTuple):
         cyclic: whether the end state must be the first one, turned about z and moved by `shift`.
         shift: (4,) m, m, m, rad: p_end = R_z(shift[3]) p_first + shift[:3].
         linear: the body's dynamics about the reference, or `NONLINEAR`.
+        load, speed: limits of the whole robot's joints, on forces (N steps) and velocities (N + 1 knots), or `NO_LOAD`.
+        reach: where they bring the points, or `NO_REACH`.
     """
 
     h: Array
@@ -63,6 +67,9 @@ class Task(NamedTuple):
     cyclic: bool
     shift: Array
     linear: LinearBody = NONLINEAR
+    load: JointLoad = NO_LOAD
+    speed: JointLoad = NO_LOAD
+    reach: Reach = NO_REACH
 
 
 @compiled

@@ -16,6 +16,8 @@ from slomo.optimize.dense import copy
 from slomo.optimize.dynamics import minus, plus
 from slomo.optimize.jit import compiled
 from slomo.optimize.linear_body import task_step
+from slomo.optimize.load import load_cost
+from slomo.optimize.reach import reach_cost
 from slomo.optimize.riccati import backward
 
 CONVERGED, ITERATIONS, STUCK, NOT_FINITE = 0, 1, 2, 3
@@ -42,11 +44,14 @@ def evaluate(body, task, kappa, it, rho, gap, w):
         u = it.us[k]
         task_step(body, task, kappa, k, length(body, task, u, k), it.qs[k], it.vs[k], u, w.q1, w.v1, it.lam[k])
         J += input_cost(body, task, k, it.vs[k], u, w.v1, it.lam[k], it.cone[k], rho)
+        J += load_cost(task.load, k, u, it.loads[k], rho)
         minus(w.q1, w.v1, it.qs[k + 1], it.vs[k + 1], gap[k])
         for i in range(gap.shape[1]):
             total += abs(gap[k, i])
     for k in range(N + 1):
         J += state_cost(body, task, k, it.qs[k], it.vs[k], it.multiplier[k], rho)
+        J += load_cost(task.speed, k, it.vs[k], it.speeds[k], rho)
+        J += reach_cost(task.reach, k, it.qs[k], it.beyond[k], rho)
     if task.cyclic:
         end_gap(task, it.qs[0], it.vs[0], it.qs[N], it.vs[N], w.end)
         J += end_cost(w.end, it.closing, rho)
@@ -109,6 +114,9 @@ def solve(body, task, kappa, it, rho, free_start, max_iterations, tolerance, clo
     nu = _LEAST_PENALTY
     copy(it.multiplier, w.trial.multiplier)
     copy(it.cone, w.trial.cone)
+    copy(it.loads, w.trial.loads)
+    copy(it.speeds, w.trial.speeds)
+    copy(it.beyond, w.trial.beyond)
     for i in range(it.closing.shape[0]):
         w.trial.closing[i] = it.closing[i]
     if not isfinite(J + G):

@@ -46,6 +46,7 @@ class JointMotion:
         q: (T, nq) Pinocchio configurations, root free flyer first (position m, quat_xyzw), then joints rad.
         v: (T, nv) root twist in the root's frame (m/s, rad/s), then joints rad/s; knot k + 1 ends step k.
         tau: (T - 1, nj) N m, inverse dynamics.  tau_static: (T - 1, nj) N m, -J^T u alone.
+        jacobian: (T, 3 C, nj) m/rad, of the contact frames by the joints.
         root_wrench: (T - 1, 6) N and N m in the root's frame that no motor gives: what the point-foot model misses of
             the whole robot.
         miss: (T, C) m, distance of the contact frames from their points.
@@ -56,6 +57,7 @@ class JointMotion:
     v: Array
     tau: Array
     tau_static: Array
+    jacobian: Array
     root_wrench: Array
     miss: Array
     reached: Array
@@ -82,14 +84,16 @@ def joint_motion(robot: Robot, reference: Reference) -> JointMotion:
     v[0, 6:] = legs.velocities(q[0], v[0, :6], v[1, 6:], r.v[0, 6:])
 
     tau, tau_static, wrench = np.empty((T - 1, nj)), np.empty((T - 1, nj)), np.empty((T - 1, 6))
+    jacobian = np.empty((T, 3 * len(legs.points), nj))
     for k in range(T - 1):
         J = legs.jacobian(q[k])[: 3 * len(legs.points)]
         a = np.concatenate([legs.root_acceleration(r.q[k], r.v[k], r.v[k + 1], r.h[k]), (v[k + 1] - v[k])[6:] / r.h[k]])
         force = pin.rnea(model, legs.data, q[k], v[k], a) - J.T @ r.lam[k].ravel()
         wrench[k], tau[k] = force[:6], force[6:]
-        tau_static[k] = -J[:, 6:].T @ r.u[k]
+        tau_static[k], jacobian[k] = -J[:, 6:].T @ r.u[k], J[:, 6:]
+    jacobian[-1] = legs.jacobian(q[-1])[: 3 * len(legs.points), 6:]
     miss = np.linalg.norm(error, axis=2)
-    return JointMotion(q, v, tau, tau_static, wrench, miss, reached=r.points - error)
+    return JointMotion(q, v, tau, tau_static, jacobian, wrench, miss, reached=r.points - error)
 
 
 class Legs:

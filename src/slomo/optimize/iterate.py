@@ -13,6 +13,7 @@ class Iterate(NamedTuple):
     Attributes:
         qs: (N + 1, 7 + 3 C), vs: (N + 1, 6 + 3 C), us: (N, nu) as in `cost.Task`.  lam: (N, C, 3) N.
         multiplier: (N + 1, M) of `constraints`.  cone: (N, C) of friction cones.  closing: (nx,) of `closing.end_gap`.
+        loads: (N, J), speeds: (N + 1, J) of `load`.  beyond: (N + 1, M) of `reach`.
     """
 
     qs: Array
@@ -22,17 +23,32 @@ class Iterate(NamedTuple):
     multiplier: Array
     cone: Array
     closing: Array
+    loads: Array
+    speeds: Array
+    beyond: Array
 
     @classmethod
     def at(cls, qs: Array, vs: Array, us: Array, *, C: int, M: int) -> Self:
         """An iterate at copies of these, for C points and M constraints, with no forces and multipliers yet."""
         z, N = np.zeros, len(us)
         qs, vs, us = (np.array(x, float, order="C") for x in (qs, vs, us))
-        return cls(qs, vs, us, z((N, C, 3)), z((N + 1, M)), z((N, C)), z(12 + 6 * C))
+        return cls(
+            qs, vs, us, z((N, C, 3)), z((N + 1, M)), z((N, C)), z(12 + 6 * C), z((N, 0)), z((N + 1, 0)), z((N + 1, 0))
+        )
 
     def copy(self) -> Self:
         """A deep copy."""
         return type(self)(*(x.copy() for x in self))
+
+    def fitting(self, *, loads: int, speeds: int, beyond: int) -> Self:
+        """A deep copy for so many limits of joints and half-spaces; multipliers of new ones are 0."""
+        z, N = np.zeros, len(self.us)
+        it = self.copy()
+        if it.loads.shape[1] != loads:
+            it = it._replace(loads=z((N, loads)))
+        if it.speeds.shape[1] != speeds:
+            it = it._replace(speeds=z((N + 1, speeds)))
+        return it._replace(beyond=np.column_stack([it.beyond, z((N + 1, beyond - it.beyond.shape[1]))]))
 
 
 class Work(NamedTuple):

@@ -1,8 +1,8 @@
 """From targets to a reference that verifies: the solver asked for, and what is tried when the verifier objects.
 
-What the point-foot model cannot know of the whole robot comes back from the verifier: where joints would be overloaded
-the forces of that limb are limited further, where joint limits keep a foot from its place the leg is made shorter, and
-where feet creep too far they are made to stick. Nothing else is changed, each attempt is told, and the last word is the
+What the point-foot model cannot know of the whole robot comes back from the verifier (`feedback`): joints' torques and
+speeds become limits on forces and velocities, places that joints do not reach half-spaces for a limb's points, and feet
+that creep too far are made to stick. Nothing else is changed, each attempt is told, and the last word is the
 verifier's.
 """
 
@@ -11,23 +11,21 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
-from scipy.spatial.transform import Rotation
 
 from slomo.motion import Reference
-from slomo.optimize import problem
+from slomo.optimize import feedback, problem
 from slomo.optimize.check import Check
 from slomo.optimize.cost import Task
 from slomo.optimize.cycle import close, end_shift, find_cycle
-from slomo.optimize.inverse import JointMotion, joint_motion
+from slomo.optimize.inverse import joint_motion
 from slomo.optimize.iterate import Iterate
 from slomo.optimize.problem import Steps, Targets, Weights
+from slomo.optimize.reach import Reach
 from slomo.optimize.scale import best_scale
 from slomo.optimize.solve import Report, Settings, Solution
 from slomo.optimize.verify import verify
 from slomo.pointfoot import PointFootModel
 from slomo.robot import Robot
-from slomo.robot_workspace import directions
 from slomo.terrain import Terrain
 
 Array = np.ndarray
@@ -39,11 +37,8 @@ SOLVERS = {
     "ipopt": ("slomo.optimize.ipopt", "solve_ipopt", "IPOPT, complementarity constraints"),
 }
 ATTEMPTS = 10
-_MISSED, _MARGIN = 1e-3, 1.3  # m from which on a miss counts, and by what factor of it a leg is made shorter
 _WEAKER, _SLOWER = 4, 1.15  # attempts with limited forces before the motion is slowed down, and by what each time
-_NEIGHBOURS = 2  # steps to either side of an overloaded one that are limited with it
 _CALMER = 4.0  # on the weight of the trunk's angular acceleration
-_TIGHTER = 0.9  # of the force that would keep a joint just within its torque limit
 
 
 @dataclass(frozen=True)
@@ -105,15 +100,16 @@ def make_plan(
         task = problem.make_task(model, want, terrain, wish.weights, steps=steps)
         return task._replace(cyclic=True, shift=end_shift(want)) if wish.cyclic else task
 
-    run, legs = _solver(wish.solver), model
+    run = _solver(wish.solver)
 
     def solve(task: Task, start: Iterate | None, settings: Settings = wish.settings) -> Solution:
         nonlocal seconds
         if start is None:
             start = problem.make_start(model, want, task)
         else:
-            settings = replace(settings, kappas=settings.kappas[-2:])
-        solution = run(legs, task, start, terrain=terrain, settings=settings, report=report)
+            # From a solution: other starts, which come from it too, have nothing to add.
+            settings = replace(settings, kappas=settings.kappas[-2:], starts=1)
+        solution = run(model, task, start, terrain=terrain, settings=settings, report=report)
         seconds += solution.seconds
         return solution
 
@@ -130,7 +126,8 @@ def make_plan(
     while True:
         attempts.append(f"{why}: {solution.status}, start {solution.start!r}, {solution.iterations} steps")
         reference = _reference(robot, model, task, solution)
-        checks = verify(model, reference, terrain=terrain, robot=robot, want=want)
+        joints = joint_motion(robot, reference)
+        checks = verify(model, reference, terrain=terrain, robot=robot, joints=joints, want=want)
         wrong = {name for name, c in checks.items() if not c.holds}
         # Of attempts that all fail, the one that is least wrong is kept.
         badness = sum(min(c.value / c.limit, 1e3) for c in checks.values() if not c.holds)
@@ -138,27 +135,31 @@ def make_plan(
             best = badness, reference, checks, solution
         if wish.solver != "ddp" or len(attempts) >= ATTEMPTS or not wrong:
             break
-        remedies, joints = [], joint_motion(robot, reference)
+        remedies = []
         if "slip_per_second" in wrong and not settings.strict:
             settings = replace(settings, strict=True)
             remedies.append("loaded feet made to stick")
         if "joint_miss" in wrong:
-            legs = _less_room(joints, reference, legs)
+            more = feedback.reach(robot, joints, reference)
+            old = task.reach if task.reach.most.size else Reach(more.normal[:, :0], more.most[:, :0])
+            task = task._replace(reach=Reach(*(np.concatenate(x, axis=1) for x in zip(old, more, strict=True))))
             remedies.append("less room where joint limits kept a point back")
         if wrong & {"torque_ratio", "speed_ratio"}:
             overloaded += 1
-            task = _limit_forces(robot, joints, reference, task)
+            task = task._replace(load=feedback.torques(robot, joints, reference))
             remedies.append("forces limited where joints were overloaded")
-            if _trunk_overloaded(robot, joints):
+            if "speed_ratio" in wrong or task.speed.most.size:
+                task = task._replace(speed=feedback.speeds(robot, joints, reference))
+                remedies.append("velocities where they were too fast")
+            if feedback.trunk_overloaded(robot, joints):
                 task = task._replace(w_spin=_CALMER * task.w_spin)
                 remedies.append("a calmer trunk")
             if overloaded > _WEAKER and not wish.cyclic:
                 # Forces alone do not help: it is the motion that asks too much.
                 slower = _SLOWER ** (overloaded - _WEAKER)
                 slow = make_task(replace(want, t=slower * want.t, v=want.v / slower), wish.steps)
-                task = slow._replace(ground=task.ground, u_low=task.u_low, u_high=task.u_high, w_spin=task.w_spin)
-                if wish.steps is not None:
-                    task.u_low[:, -1], task.u_high[:, -1] = slow.u_low[:, -1], slow.u_high[:, -1]
+                known = {name: getattr(task, name) for name in ("ground", "w_spin", "load", "speed", "reach")}
+                task = slow._replace(**known)
                 remedies.append(f"the motion slowed down to {100 / slower:.0f} %")
         if not remedies:
             break
@@ -181,66 +182,3 @@ def _reference(robot: Robot, model: PointFootModel, task: Task, solution: Soluti
         t=np.concatenate([[0.0], np.cumsum(h)]), h=h.copy(), q=it.qs, v=it.vs, u=it.us[:, :nf].copy(), lam=it.lam,
         point_names=robot.foot_names, robot_digest=robot.digest, cycle=task.shift if task.cyclic else np.zeros(0),
     )  # fmt: skip
-
-
-def _limit_forces(robot: Robot, joints: JointMotion, reference: Reference, task: Task) -> Task:
-    """The task with the forces of a limb scaled down around the steps where one of its joints is overloaded."""
-    ratio = np.abs(joints.tau) / robot.effort
-    model = robot.model
-    u_low, u_high = task.u_low.copy(), task.u_high.copy()
-    for c, name in enumerate(robot.foot_names):
-        chain = model.supports[model.frames[model.getFrameId(name)].parentJoint]
-        moved = [model.idx_vs[j] - 6 for j in chain if j > 1]
-        over = ratio[:, moved].max(axis=1)
-        # What is taken away from one step must not come back in the next.
-        over = np.where(over > 1.0, over, 0.0)
-        near = maximum_filter1d(over, 2 * _NEIGHBOURS + 1)
-        columns = slice(3 * c, 3 * c + 3)
-        for k in np.flatnonzero(near > 1.0):
-            # A foot in the air can push no less than its own weight: what is small is left alone.
-            there = np.abs(reference.u[max(k - _NEIGHBOURS, 0) : k + _NEIGHBOURS + 1, columns]).max(axis=0)
-            most = np.maximum(there * _TIGHTER / near[k], 0.05 * u_high[k, columns])
-            u_high[k, columns] = np.minimum(u_high[k, columns], most)
-            u_low[k, columns] = np.maximum(u_low[k, columns], -most)
-    return task._replace(u_low=u_low, u_high=u_high)
-
-
-def _trunk_overloaded(robot: Robot, joints: JointMotion) -> bool:
-    """Whether a joint is overloaded that carries no foot: then it is the trunk's acceleration that asks too much."""
-    ratio = (np.abs(joints.tau) / robot.effort).max(axis=0)
-    model = robot.model
-    legs = {
-        model.idx_vs[j] - 6
-        for c, name in enumerate(robot.foot_names)
-        if np.isfinite(robot.clearance[c])
-        for j in model.supports[model.frames[model.getFrameId(name)].parentJoint]
-        if j > 1
-    }
-    return any(ratio[j] > 1.0 for j in range(len(ratio)) if j not in legs)
-
-
-def _less_room(joints: JointMotion, reference: Reference, model: PointFootModel) -> PointFootModel:
-    """The model with less room for a point that the joints cannot bring where the reference has it.
-
-    A point missed along its leg changes the leg's limits. One missed across it moves the half-space of its workspace
-    that looks most in that direction: the hull of what joints reach is larger than what they reach.
-    """
-    R = Rotation.from_quat(reference.q[:, 3:7])
-    leg_min, leg_max, workspace = model.leg_min.copy(), model.leg_max.copy(), model.workspace.copy()
-    normals = directions()
-    for c in range(model.C):
-        wanted, reached = (R.inv().apply(x[:, c] - reference.q[:, :3]) for x in (reference.points, joints.reached))
-        for k in np.flatnonzero(joints.miss[:, c] > _MISSED):
-            off = wanted[k] - reached[k]
-            far, near = (float(np.linalg.norm(x[k] - model.leg_roots[c])) for x in (wanted, reached))
-            if abs(far - near) > 0.7 * np.linalg.norm(off):
-                room = far + _MARGIN * (near - far)
-                middle = (model.leg_min[c] + model.leg_max[c]) / 2
-                if far > near:
-                    leg_max[c] = min(leg_max[c], max(room, (middle + model.leg_max[c]) / 2))
-                else:
-                    leg_min[c] = max(leg_min[c], min(room, (middle + model.leg_min[c]) / 2))
-            else:
-                n = int(np.argmax(normals @ off))
-                workspace[c, n] = min(workspace[c, n], normals[n] @ (wanted[k] - _MARGIN * off))
-    return replace(model, leg_max=leg_max, leg_min=leg_min, workspace=workspace)

@@ -17,6 +17,8 @@ from slomo.optimize.dense import (
 )
 from slomo.optimize.jit import compiled
 from slomo.optimize.linear_body import task_linearize
+from slomo.optimize.load import load_derivative
+from slomo.optimize.reach import reach_derivative
 
 # Proximal weights of the Levenberg-Marquardt term: positions, velocities, inputs (1/m^2, s^2/m^2, 1/N^2), step length.
 _PROX_Q, _PROX_V, _PROX_U, _PROX_H = 1.0, 1e-2, 1e-4, 1e2
@@ -48,6 +50,8 @@ def backward(body, task, kappa, it, rho, reg, free_start, w):
             Lx[i] = 0.0
         if k == N:
             state_derivative(body, task, k, it.qs[k], it.vs[k], it.multiplier[k], rho, Lx, Vxx)
+            reach_derivative(task.reach, k, it.qs[k], it.beyond[k], rho, Lx, Vxx)
+            load_derivative(task.speed, k, it.vs[k], it.speeds[k], rho, Lx[nv:], Vxx[nv:, nv:])
             for i in range(nx):
                 Vx[i] = Lx[i]
             if task.cyclic:
@@ -79,7 +83,10 @@ def backward(body, task, kappa, it, rho, reg, free_start, w):
             for i in range(nu):
                 Lu[i] = 0.0
             input_derivative(body, task, k, v, u, w.v1, it.lam[k], it.cone[k], rho, A, B, w.D, Lx, Lu, Qxx, Quu, Qux)
+            load_derivative(task.load, k, u, it.loads[k], rho, Lu, Quu)
             state_derivative(body, task, k, it.qs[k], it.vs[k], it.multiplier[k], rho, Lx, Qxx)
+            reach_derivative(task.reach, k, it.qs[k], it.beyond[k], rho, Lx, Qxx)
+            load_derivative(task.speed, k, it.vs[k], it.speeds[k], rho, Lx[nv:], Qxx[nv:, nv:])
             for i in range(nu):
                 Quu[i, i] += reg * (_PROX_U if i < nf else _PROX_H)
                 lower[i], upper[i] = task.u_low[k, i] - u[i], task.u_high[k, i] - u[i]

@@ -12,6 +12,8 @@ from slomo.optimize.closing import end_gap, end_penalty
 from slomo.optimize.cost import Task, cone, cone_penalty
 from slomo.optimize.dynamics import Body
 from slomo.optimize.iterate import Iterate, Work
+from slomo.optimize.load import load_excess, load_penalty
+from slomo.optimize.reach import reach_excess
 from slomo.pointfoot import PointFootModel
 from slomo.terrain import Terrain
 
@@ -36,6 +38,7 @@ class Settings:
         tolerance: of the relative decrease still expected.
         penalty: 1/m^2, first penalty of the constraints.
         constraint_tolerance: m, largest violation accepted.  cone_tolerance: N, the same of a friction cone.
+        load_tolerance: the same of joint torques and speeds over their limits.  reach_tolerance: m, of `reach`.
         end_tolerance: m, rad, m/s, rad/s, of the end of a cyclic motion.
         rounds: of the augmented Lagrangian (and of moving the ground) at the last kappa.
         most_iterations: in all, from one start.
@@ -50,6 +53,8 @@ class Settings:
     penalty: float = 1e4
     constraint_tolerance: float = 5e-5
     cone_tolerance: float = 1e-3
+    load_tolerance: float = 5e-3
+    reach_tolerance: float = 5e-4
     end_tolerance: float = 5e-7
     rounds: int = 16
     most_iterations: int = 1500
@@ -170,15 +175,22 @@ class _Multipliers:
         """New multipliers in `it`; returns the largest violation relative to its tolerance."""
         rho = self.penalty
         g, sliding, end = _violations(body, task, it)
+        over, fast = load_excess(task.load, it.us), load_excess(task.speed, it.vs)
+        beyond = reach_excess(task.reach, it.qs)
         equal = np.array([constraints.is_equality(body, n) for n in range(g.shape[1])], bool)
         worst = max(
             float(np.where(equal, np.abs(g), g).max(initial=0.0)) / settings.constraint_tolerance,
             float(sliding.max(initial=0.0)) / settings.cone_tolerance,
+            float(max(over.max(initial=0.0), fast.max(initial=0.0))) / settings.load_tolerance,
+            float(beyond.max(initial=0.0)) / settings.reach_tolerance,
             float(np.abs(end).max(initial=0.0)) / settings.end_tolerance,
         )
         it.multiplier[:] = it.multiplier + rho * np.where(np.isfinite(g), g, 0.0)
         it.multiplier[:] = np.where(equal, it.multiplier, np.maximum(it.multiplier, 0.0))
         it.cone[:] = np.where(task.stick, np.maximum(0.0, it.cone + cone_penalty(rho) * sliding), 0.0)
+        it.loads[:] = np.maximum(0.0, it.loads + load_penalty(rho) * over)
+        it.speeds[:] = np.maximum(0.0, it.speeds + load_penalty(rho) * fast)
+        it.beyond[:] = np.maximum(0.0, it.beyond + rho * beyond)
         if task.cyclic:
             nv = len(end) // 2
             it.closing[:] += np.array([end_penalty(rho, i, nv) for i in range(2 * nv)]) * end
@@ -192,7 +204,8 @@ def _descend(
     model: PointFootModel, task: Task, start: Iterate, terrain: Terrain, s: Settings, report: Report
 ) -> Solution:
     """From one start through all kappas, and once more with sticking points where that is asked for."""
-    body, it = Body.of(model), start.copy()
+    body, (loads, speeds, beyond) = Body.of(model), (x.most.shape[1] for x in (task.load, task.speed, task.reach))
+    it = start.fitting(loads=loads, speeds=speeds, beyond=beyond)
     work = Work.make(it, cyclic=task.cyclic)
     multipliers = _Multipliers(s.penalty)
     reg, iterations, cost, failure = 1e-3, 0, np.inf, ""

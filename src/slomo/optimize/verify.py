@@ -49,6 +49,7 @@ def verify(
     *,
     terrain: Terrain,
     robot: Robot | None = None,
+    joints: JointMotion | None = None,
     want: Wanted | None = None,
 ) -> dict[str, Check]:
     """All checks by name; the reference is verified when every one `holds`.
@@ -58,7 +59,8 @@ def verify(
     input_ratio: |u| / u_max.  leg_length: m beyond the limits.  pair_distance: m, toe to heel, off their distance.
     body_clearance: m by which a point comes too near to the body.  cycle_gap: m, rad, m/s and rad/s by which a motion
     that is to repeat for ever does not close.
-    With a robot, those of `joint_checks`.  With what was wanted, `body_error` and `foot_error` (warnings): m, mean.
+    With a robot, those of `joint_checks`, from its `joint_motion` unless that is given as `joints`.  With what was
+    wanted, `body_error` and `foot_error` (warnings): m, mean.
     """
     r, names = reference, model.names
     parts = ("body position", "body rotation", "body velocity", *names, "time")
@@ -81,7 +83,7 @@ def verify(
         parts = ("body position", "body rotation", "body velocity", *names)
         checks["cycle_gap"] = worst(cycle_gap(r), 1e-6, "", r.t[-1:], parts)
     if robot is not None:
-        checks |= joint_checks(robot, r, joint_motion(robot, r))
+        checks |= joint_checks(robot, r, joints or joint_motion(robot, r))
     if want is not None:
         checks |= tracking_checks(r, want, names)
     return checks
