@@ -110,7 +110,7 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
     "walk": partial(synthetic, "walk", "g1", 2.0),
     "cat00": partial(published, "cat00", "go1"),
     "dog_cpr": partial(published, "dog_cpr", "go1", start=26 / 30, end=108 / 30, step_height=0.1),
-    "human_jumping_jack": partial(published, "human_jumping_jack", "g1", end=4.0),
+    "human_jumping_jack": partial(published, "human_jumping_jack", "g1"),
 }
 
 
