@@ -21,7 +21,7 @@ from slomo.stage import Arrays, Artifact, Inputs, Progress
 
 Array = np.ndarray
 
-VERSION = 5
+VERSION = 6
 MOST_FRAMES = 600  # that are looked at: each takes 3 MB, and long clips are not to take more than others
 
 PRIORS = ("auto", "none")

@@ -21,7 +21,7 @@ from slomo.reconstruct.run import Run, from_arrays
 from slomo.reconstruct.verdict import Facts, checks, verdict
 from slomo.stage import Artifact, Inputs, Progress
 
-REFINE_VERSION = 6
+REFINE_VERSION = 7
 
 
 @dataclass(frozen=True)
