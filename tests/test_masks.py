@@ -11,6 +11,7 @@ from slomo.reconstruct.flow import dense_flow
 from slomo.reconstruct.motion_segment import border_distance
 from slomo.reconstruct.segment import blend_over_time, component_at, frame_certainty, frame_quality, spans
 from slomo.reconstruct.stage import DecodeConfig, MasksConfig, pack, run_decode, run_masks, unpack
+from slomo.reconstruct.votes import vote_over_time
 from slomo.stage import Artifact, Inputs, Silent
 
 SHARED = Path(__file__).parents[2] / "shared"
@@ -69,6 +70,30 @@ def test_chained_flow_and_the_frames_between():
     layers = {t: masks[t].astype(np.float32) for t in (0, 2, 4, 6, 7)}
     filled = np.stack([*blend_over_time(layers, flow, lambda f: None, neighbours=1)])
     assert iou(filled > 0.5, masks).min() > 0.9
+
+
+def test_votes_find_what_single_frames_miss_and_stop_at_another_colour():
+    """A piece that the network misses in two frames is found from the others; what it sees once is outvoted."""
+    frames, masks = moving_disc(16)
+    flow = dense_flow(frames)
+    piece = np.zeros_like(masks)
+    for t in range(len(masks)):
+        piece[t, 52:68, 38 + 2 * t : 48 + 2 * t] = True  # moves with the ellipse, whose centre is at 60 + 2 t
+    layers = {t: masks[t].astype(np.float32) for t in range(16)}
+    for t in (7, 8):
+        layers[t] = np.where(piece[t], 0, layers[t])
+    layers[12] = layers[12].copy()
+    layers[12][5:20, 5:20] = 1
+    votes = np.stack([*vote_over_time(layers, frames, flow, lambda f: None)])
+    for t in (7, 8):
+        assert votes[t][piece[t]].mean() > 0.5
+    assert votes[12][5:20, 5:20].mean() < 0.4
+    assert iou(votes > 0.5, masks).min() > 0.9
+    # The same piece in another colour in those frames is another point: nothing is carried there.
+    for t in (7, 8):
+        frames[t][piece[t]] = 255 - frames[t][piece[t]]
+    other = np.stack([*vote_over_time(layers, frames, flow, lambda f: None)])
+    assert other[8][piece[8]].mean() < 0.5 * votes[8][piece[8]].mean()
 
 
 def test_component_and_reach():
