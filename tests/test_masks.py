@@ -89,6 +89,9 @@ def test_votes_find_what_single_frames_miss_and_stop_at_another_colour():
         assert votes[t][piece[t]].mean() > 0.5
     assert votes[12][5:20, 5:20].mean() < 0.4
     assert iou(votes > 0.5, masks).min() > 0.9
+    # However far apart the frames are that the network saw, those between are filled.
+    sparse = {t: masks[t].astype(np.float32) for t in (0, 15)}
+    assert iou(np.stack([*vote_over_time(sparse, frames, flow, lambda f: None)]) > 0.5, masks).min() > 0.7
     # The same piece in another colour in those frames is another point: nothing is carried there.
     for t in (7, 8):
         frames[t][piece[t]] = 255 - frames[t][piece[t]]

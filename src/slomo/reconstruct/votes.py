@@ -10,7 +10,7 @@ from slomo.reconstruct.colour import to_lab
 from slomo.reconstruct.flow import Flow, sample
 from slomo.reconstruct.segment import Report
 
-REACH = 6  # frames either way from which a vote is taken
+REACH = 6  # frames either way from which a vote is taken at least
 _SPREAD = 3.0  # frames in which a vote loses its weight
 _SHADE = 15.0  # of Lab (0 to 255): what has another colour is another point
 
@@ -29,16 +29,18 @@ def vote_over_time(
         frames: (T, H, W, 3) uint8 RGB.
     """
     T, (height, width) = len(frames), flow.forward.shape[1:3]
+    # Frames between layers that lie further apart still need one on either side.
+    reach = max(REACH, int(np.diff(sorted(layers)).max(initial=0)))
     to_cells = np.array([width / flow.size[0], height / flow.size[1]], np.float32)
 
     def small(image: np.ndarray) -> np.ndarray:
         return cv2.resize(image.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
 
-    @lru_cache(2 * REACH + 2)
+    @lru_cache(2 * reach + 2)
     def seen(k: int) -> tuple[np.ndarray | None, np.ndarray]:
         return small(layers[k]) if k in layers else None, small(to_lab(frames[k]))
 
-    @lru_cache(2 * REACH + 2)
+    @lru_cache(2 * reach + 2)
     def step(k: int, ahead: bool) -> tuple[np.ndarray, np.ndarray]:
         """Cells from frame k to the next (or from k + 1 back), and where that leads home again."""
         there = (flow.forward if ahead else flow.backward)[k].astype(np.float32) * to_cells
@@ -48,10 +50,10 @@ def vote_over_time(
     for t in range(T):
         own, shade = seen(t)
         total = np.zeros((height, width), np.float32) if own is None else own.copy()
-        weight = np.full((height, width), 1e-6 if own is None else 1.0, np.float32)
+        weight = np.full((height, width), 1e-9 if own is None else 1.0, np.float32)
         for direction in (1, -1):
             offset, lasting = np.zeros((height, width, 2), np.float32), np.ones((height, width), np.float32)
-            for n in range(1, REACH + 1):
+            for n in range(1, reach + 1):
                 k = t + direction * n
                 if not 0 <= k < T:
                     break
@@ -64,7 +66,7 @@ def vote_over_time(
                 change = ((sample(colour, offset) - shade) ** 2).sum(-1)
                 w = lasting * np.exp(-0.5 * ((n / _SPREAD) ** 2 + change / _SHADE**2), dtype=np.float32)
                 # A frame that the network has not seen is filled from its neighbours even where flow is in doubt.
-                w = np.maximum(w, 1e-3 * np.exp(-float(n))) if own is None else w
+                w = np.maximum(w, 1e-3 * np.exp(-n / _SPREAD)) if own is None else w
                 total += w * sample(said, offset)
                 weight += w
         yield cv2.resize(total / weight, flow.size, interpolation=cv2.INTER_LINEAR)
