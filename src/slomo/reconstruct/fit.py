@@ -33,7 +33,7 @@ class Effort:
 
 
 def fit(problem: Problem, root: RootGuess, effort: Effort, *, metres: float, seed: int, progress: Progress) -> Run:
-    """Fit from the root path to the winner.
+    """Fit from the root path to the winner: all frames are looked at in the last phase only.
 
     Args:
         metres: wanted body length m, for Froude numbers.
@@ -41,11 +41,13 @@ def fit(problem: Problem, root: RootGuess, effort: Effort, *, metres: float, see
     """
     generator = torch.Generator().manual_seed(seed)
     run, start, adam_state = restore(progress.load(), generator)
+    coarse = problem.coarse()
     if run is None:
-        run = _start(problem, root, generator)
+        run = _start(coarse, root, generator)
     total = total_cost(effort)
     while True:
         schedule = effort.schedules[run.phase]
+        now = problem if run.phase == len(PHASES) - 1 else coarse
         done = sum(s.iterations * _cost(s) for s in effort.schedules[: run.phase])
 
         def each(i: int, optimiser: torch.optim.Adam, loss: Tensor, run=run, schedule=schedule, done=done) -> None:
@@ -54,11 +56,9 @@ def fit(problem: Problem, root: RootGuess, effort: Effort, *, metres: float, see
             if progress.checkpoint_due():
                 progress.save(checkpoint(run, i, optimiser, generator))
 
-        run.x = optimise(
-            problem, run.x, run.guess, schedule, generator, start=start, adam_state=adam_state, each=each
-        )  # fmt: skip
+        run.x = optimise(now, run.x, run.guess, schedule, generator, start=start, adam_state=adam_state, each=each)
         start, adam_state = 0, None
-        losses = rank(problem, run.x, run.guess)
+        losses = rank(now, run.x, run.guess)
         run.log[PHASES[run.phase]] = [
             label | {"loss": round(float(v), 4)} for label, v in zip(run.labels, losses, strict=True)
         ]
@@ -67,7 +67,7 @@ def fit(problem: Problem, root: RootGuess, effort: Effort, *, metres: float, see
             run.log["final"] = [run.log["final"][int(k)] for k in order]
             best = order[:1]
             return Run(run.phase, _pick(run.x, best), run.guess.pick(best), [run.labels[int(best)]], run.log)
-        run = (_to_gait, _to_rivals, _to_final)[run.phase](problem, run, losses, root, effort, metres, progress)
+        run = (_to_gait, _to_rivals, _to_final)[run.phase](now, run, losses, root, effort, metres, progress)
 
 
 def polish(problem: Problem, run: Run, schedule: Schedule, *, seed: int, progress: Progress) -> Run:

@@ -18,6 +18,7 @@ Tensor = torch.Tensor
 
 SOFT_PX = 0.7  # width of the silhouette's edge and of the smooth minimum over capsules, working pixels
 SWING = 3.0  # accelerations of a gait's nodes in units of speed squared over body length
+SLIDE = 0.75  # body lengths / s of a standing foot: the unit of its drift
 FLOW_PX = 0.25  # flow errors below this are noise, working pixels
 
 
@@ -110,9 +111,9 @@ def misfit(s: State) -> Tensor:
 
 
 def flow(s: State) -> Tensor:
-    """Optical flow: the surface point that a mask pixel sees moves with its link to the next fit frame."""
+    """Optical flow: the surface point that a mask pixel sees moves with its link to the fit frame a span later."""
     obs, K = s.obs, s.obs.K
-    pairs = s.seen < len(obs.at) - 1
+    pairs = s.seen < len(obs.at) - obs.span
     k = s.seen[pairs]
     u, v, pixel = s.u[pairs][:, : s.inside], s.v[pairs][:, : s.inside], s.pixel[pairs][:, : s.inside]
     sub = Outline(**{f: getattr(s.out, f)[:, pairs] for f in Outline.__dataclass_fields__})
@@ -130,14 +131,14 @@ def flow(s: State) -> Tensor:
 
 
 def carry(s: State, k: Tensor, c: Tensor, X: Tensor) -> Tensor:
-    """(H, S, P, 2) px where camera-frame points X of frames k, fixed to capsules c, are seen in frames k + 1."""
-    kin, body = s.kin, s.body
+    """(H, S, P, 2) px where camera-frame points X of frames k, fixed to capsules c, are seen a span of the flow later."""
+    kin, body, later = s.kin, s.body, k + s.obs.span
     H, S, P = c.shape
-    # Camera of frame k -> link -> camera of frame k + 1, composed per capsule before it is gathered per pixel.
+    # Camera of frame k -> link -> camera of the later frame, composed per capsule before it is gathered per pixel.
     R0 = s.R_cam[:, k][:, :, None] @ body.R[:, k][:, :, kin.c_link]
-    R1 = s.R_cam[:, k + 1][:, :, None] @ body.R[:, k + 1][:, :, kin.c_link]
+    R1 = s.R_cam[:, later][:, :, None] @ body.R[:, later][:, :, kin.c_link]
     R = R1 @ R0.transpose(-1, -2)
-    a0, a1 = s.ends[0][:, k], s.ends[0][:, k + 1]
+    a0, a1 = s.ends[0][:, k], s.ends[0][:, later]
     p = a1 - (R @ a0[..., None])[..., 0]
     Rg = torch.gather(R.reshape(H, S, -1, 9), 2, c[..., None].expand(H, S, P, 9)).reshape(H, S, P, 3, 3)
     pg = torch.gather(p, 2, c[..., None].expand(H, S, P, 3))
@@ -186,7 +187,7 @@ def stance(s: State) -> Tensor:
     """A foot that stands stays where it is, on the ground."""
     height, velocity, _ = feet(s)
     w = contact_weight(s)
-    drift = (velocity[..., :2] * s.obs.dt[:, None, None] / 0.05).square().sum(-1)
+    drift = (velocity[..., :2] / SLIDE).square().sum(-1)
     lift = ((height[:, 1:] / 0.04).square() + (height[:, :-1] / 0.04).square()) / 2
     both = drift / (1 + drift).detach().sqrt() + lift / (1 + lift).detach().sqrt()
     return (w * both).sum((1, 2)) / both[0].numel()

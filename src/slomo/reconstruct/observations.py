@@ -1,11 +1,11 @@
 """What the fit compares with: masks, distance transforms, chained flow and cameras, at a working resolution.
 
-Fit frames are every n-th frame of the clip; the flow between two of them is the flow of the frames between, chained.
+Fit frames are every n-th frame of the clip. Flow is looked at over a fifteenth of a second, which may be several of
+them: between frames closer than that it is little more than noise. The flow of the frames between is chained.
 """
 
-import itertools
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -14,7 +14,7 @@ import torch
 from slomo.errors import InvalidData
 from slomo.ground_path import mask_box
 from slomo.pinhole import Intrinsics, ground_points
-from slomo.prior.frames import every, spread
+from slomo.prior.frames import SPAN, every, spread
 
 Array = np.ndarray
 Tensor = torch.Tensor
@@ -33,7 +33,7 @@ class Observations:
         T_world_cam: (T, 4, 4) as given.
         mask: (F, n) bool; edge: (F, 1, h, w) px, signed distance to the mask's edge, positive outside.
         draw_in, draw_out: (F, n) cumulative probabilities for drawing mask and background pixels.
-        flow: (F-1, n, 2) px; flow_ok: (F-1, n) bool.
+        span: fit frames between the two pictures of a flow, S. flow: (F-S, n, 2) px; flow_ok: (F-S, n) bool.
         static: (F, 1, h, w) in [0, 1], how surely a mask pixel moves as a point of the ground there would.
         quality: (F,) in [0, 1]. box: (F, 4) u0, v0, u1, v1 px of the mask; empty: (F,) bool.
         flow_size: px, robust magnitude of the flow inside the mask.
@@ -49,6 +49,7 @@ class Observations:
     edge: Tensor
     draw_in: Tensor
     draw_out: Tensor
+    span: int
     flow: Tensor
     flow_ok: Tensor
     static: Tensor
@@ -56,6 +57,16 @@ class Observations:
     box: Array
     empty: Array
     flow_size: float
+
+    def coarse(self) -> "Observations":
+        """The same at fit frames a span of the flow apart."""
+        n = self.span
+        at = self.at[::n]
+        by_frame = ("mask", "edge", "draw_in", "draw_out", "static", "quality", "box", "empty")
+        return replace(
+            self, at=at, dt=self.t[at].diff(), span=1, flow=self.flow[::n][: len(at) - 1],
+            flow_ok=self.flow_ok[::n][: len(at) - 1], **{k: getattr(self, k)[::n] for k in by_frame},
+        )  # fmt: skip
 
 
 def unpack(packed: Array, shape: Array) -> Array:
@@ -98,12 +109,14 @@ def observe(
     K = Intrinsics(
         K0[0, 0] * scale, K0[1, 1] * scale, (K0[0, 2] + 0.5) * scale - 0.5, (K0[1, 2] + 0.5) * scale - 0.5, w, h
     )
-    fl, ok = np.empty((len(at) - 1, h, w, 2), np.float32), np.empty((len(at) - 1, h, w), bool)
-    for i, (first, last) in enumerate(itertools.pairwise(at.tolist())):
+    span = max(1, round(SPAN / float(np.median(np.diff(np.asarray(frames_t, float)[at]))))) if len(at) > 1 else 1
+    span = min(span, max(1, len(at) - 1))
+    fl, ok = np.empty((len(at) - span, h, w, 2), np.float32), np.empty((len(at) - span, h, w), bool)
+    for i, (first, last) in enumerate(zip(at[:-span].tolist(), at[span:].tolist(), strict=True)):
         total, sure = _chain(flow, first, last, (width, height))
         fl[i], ok[i] = smaller(total) * scale, smaller(sure) > 0.7
     T_world_cam = np.asarray(camera["T_world_cam"], float)
-    static = _static(K, T_world_cam[at], mask, fl, ok)
+    static = _static(K, T_world_cam[at], mask, fl, ok, span)
     distance = lambda m: cv2.distanceTransform(m.astype(np.uint8), cv2.DIST_L2, 3)  # noqa: E731
     inside = np.stack([distance(m) for m in mask])
     outside = np.stack([distance(~m) if m.any() else np.zeros((h, w), np.float32) for m in mask])
@@ -112,13 +125,13 @@ def observe(
     # Thin parts (legs) are drawn as often as thick ones; background is drawn near the subject and everywhere.
     draw_in = _cumulative(m / (1 + i) for m, i in zip(mask, inside, strict=True))
     draw_out = _cumulative(_beside(m, o) for m, o in zip(mask, outside, strict=True))
-    size = np.linalg.norm(fl, axis=-1)[ok & mask[:-1]]
+    size = np.linalg.norm(fl, axis=-1)[ok & mask[:-span]]
     f = lambda x: torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)  # noqa: E731
     flat = lambda x: torch.as_tensor(np.ascontiguousarray(x)).reshape(len(x), h * w, *x.shape[3:])  # noqa: E731
     return Observations(
         t=f(frames_t), at=torch.as_tensor(at), dt=f(np.diff(np.asarray(frames_t)[at])), K=K, scale=scale,
         T_world_cam=T_world_cam, mask=flat(mask), edge=f(outside - inside)[:, None], draw_in=draw_in, draw_out=draw_out,
-        flow=flat(fl), flow_ok=flat(ok & mask[:-1]), static=f(static)[:, None],
+        span=span, flow=flat(fl), flow_ok=flat(ok & mask[:-span]), static=f(static)[:, None],
         quality=f(masks["quality"][at]) * f(~empty), box=box, empty=empty,
         flow_size=float(np.quantile(size, 0.5)) if len(size) else 1.0,
     )  # fmt: skip
@@ -158,18 +171,18 @@ def _at(image: Array, uv: Array) -> Array:
     return cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR)
 
 
-def _static(K: Intrinsics, T_world_cam: Array, mask: Array, flow: Array, ok: Array) -> Array:
-    """How surely each mask pixel moves with the ground under it; the last fit frame repeats the one before."""
+def _static(K: Intrinsics, T_world_cam: Array, mask: Array, flow: Array, ok: Array, span: int) -> Array:
+    """How surely each mask pixel moves with the ground under it; the last fit frames repeat the one before."""
     F, h, w = mask.shape
     v, u = np.mgrid[:h, :w].astype(float)
     out = np.zeros((F, h, w), np.float32)
-    for i in range(F - 1):
+    for i in range(F - span):
         X = ground_points(K, T_world_cam[i], u, v)
-        Y = (X - T_world_cam[i + 1, :3, 3]) @ T_world_cam[i + 1, :3, :3]
+        Y = (X - T_world_cam[i + span, :3, 3]) @ T_world_cam[i + span, :3, :3]
         z = np.maximum(Y[..., 2], 1e-6)
         moved = np.stack([K.fx * Y[..., 0] / z + K.cx - u, K.fy * Y[..., 1] / z + K.cy - v], -1)
         error = np.linalg.norm(flow[i] - moved, axis=-1)
         score = np.exp(-((error / STATIC_PX) ** 2) / 2)
         out[i] = np.where(mask[i] & ok[i] & np.isfinite(error), score, 0)
-    out[-1] = out[-2] if F > 1 else 0
+    out[F - span :] = out[F - span - 1] if F > span else 0
     return out

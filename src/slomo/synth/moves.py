@@ -110,6 +110,16 @@ def _quadruped_posture(skeleton: Skeleton, name: str, q: Array, rng: np.random.G
     return 0.0
 
 
+def _carry_head(skeleton: Skeleton, q: Array, rng: np.random.Generator) -> None:
+    """Lay over angles (T, B, 3), in place, how high the head is carried and where it looks: the rest pose holds it up,
+    but many animals walk with it at the height of their back, and all look about."""
+    lowered = np.radians(rng.uniform(-15, 55))
+    aside = np.radians(rng.uniform(-110, 110)) * (rng.random() < 0.5)
+    for word, pitch, yaw in (("withers", 1.0, 0.4), ("neck", 0.0, 0.3), ("head", -0.7, 0.3)):
+        for j in _joint(skeleton, word):
+            q[:, j] += [0, pitch * lowered, yaw * aside]
+
+
 QUADRUPED = {"gait": 0.56, "stand": 0.1, "sit": 0.05, "rear": 0.05, "lie": 0.03, "bow": 0.04, "reach": 0.07,
              "graze": 0.06, "any": 0.04}  # fmt: skip
 HUMAN = {"gait": 0.3, "stand": 0.1, "squat": 0.1, "stretch": 0.12, "jack": 0.12, "wave": 0.12, "any": 0.14}
@@ -137,6 +147,7 @@ def _quadruped(c: Creature, t: Array, rng: np.random.Generator) -> Move:
     q += _wander(s, t, rng, 0.9 if name == "any" else 0.18)
     free = _joint(s, "tail") + _joint(s, "neck") + _joint(s, "withers") + _joint(s, "head")
     q[:, free] += (_wander(s, t, rng, rng.uniform(0.3, 1.0)))[:, free]
+    _carry_head(s, q, rng)
     tilt = _quadruped_posture(s, name, q, rng)
     q = np.clip(q, s.lower[: s.link_count], s.upper[: s.link_count])
     q[:, 0] = 0
