@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 import slomo.skeleton
 from slomo.cli.session import Session
-from slomo.formats import keypoint_motion
+from slomo.formats import load_keypoints
 from slomo.prior import stage as prior_stage
 from slomo.reconstruct import fit_stage, refine_stage
 from slomo.stage import Artifact, Inputs, Silent
@@ -99,15 +99,16 @@ def spoiled_bones(kind: str, out: Path, rng: np.random.Generator) -> Path:
     return path
 
 
-def figure(inputs: Inputs, kind: str, truth: dict[str, Array], seed: int) -> float:
-    """PA-MPJPE, per cent, of evidence and fit of these inputs."""
+def figure(inputs: Inputs, kind: str, truth: dict[str, Array], seed: int, out: Path) -> float:
+    """PA-MPJPE, per cent, of evidence and fit of these inputs; `out` keeps the last key points."""
     config = refine_stage.ReconstructConfig(skeleton=kind, fields=False, physics=False, seed=seed)
     said = prior_stage.run(inputs, prior_stage.Config(skeleton=kind, fps=config.fps), Silent())
     inputs = replace(inputs, artifacts={**inputs.artifacts, "evidence": said})
     fitted = fit_stage.run_fit(inputs, config, Silent())
     inputs = replace(inputs, artifacts={**inputs.artifacts, "fit": fitted})
     result: Artifact = refine_stage.run_refine(inputs, config, Silent())
-    return score(keypoint_motion(result.npz["keypoints.npz"]), truth)["pa_mpjpe_percent"]
+    np.savez(out / "keypoints.npz", **result.npz["keypoints.npz"])
+    return score(load_keypoints(out / "keypoints.npz"), truth)["pa_mpjpe_percent"]
 
 
 def main() -> None:
@@ -133,10 +134,10 @@ def main() -> None:
                 whole, files={"skeleton": spoiled_bones(kind, args.out, rng)}
             ),
         }
-        base = figure(whole, kind, truth, args.seed)
+        base = figure(whole, kind, truth, args.seed, args.out)
         print(f"{folder.name:<16} {'as it is':<8} {base:6.1f} {1:6.2f}", flush=True)
         for case in args.cases.split(","):
-            pa = figure(cases[case](), kind, truth, args.seed)
+            pa = figure(cases[case](), kind, truth, args.seed, args.out)
             print(f"{folder.name:<16} {case:<8} {pa:6.1f} {pa / base:6.2f}", flush=True)
 
 

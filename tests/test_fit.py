@@ -208,7 +208,7 @@ def test_flow_is_over_the_same_time_at_any_rate():
     camera = dict(K=np.diag([100.0, 100.0, 1.0]), T_world_cam=np.tile(_camera(), (12, 1, 1)))
     slow, fast = (observe(np.arange(12) / 30, masks, flow, camera, fps=fps, subject_px=999) for fps in (15, 30))
     assert (slow.span, fast.span) == (1, 2)
-    assert len(slow.flow) == 5 and len(fast.flow) == 10
+    assert (len(slow.flow), len(fast.flow)) == (5, 10)
     for obs in (slow, fast):
         assert torch.allclose(obs.flow[obs.flow_ok], torch.tensor([3.0, 0.0]))
     coarse = fast.coarse()

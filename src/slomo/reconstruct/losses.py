@@ -131,7 +131,7 @@ def flow(s: State) -> Tensor:
 
 
 def carry(s: State, k: Tensor, c: Tensor, X: Tensor) -> Tensor:
-    """(H, S, P, 2) px where camera-frame points X of frames k, fixed to capsules c, are seen a span of the flow later."""
+    """(H, S, P, 2) px where camera-frame points X of frames k, fixed to capsules c, are seen a flow's span later."""
     kin, body, later = s.kin, s.body, k + s.obs.span
     H, S, P = c.shape
     # Camera of frame k -> link -> camera of the later frame, composed per capsule before it is gathered per pixel.

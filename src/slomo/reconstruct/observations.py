@@ -184,5 +184,5 @@ def _static(K: Intrinsics, T_world_cam: Array, mask: Array, flow: Array, ok: Arr
         error = np.linalg.norm(flow[i] - moved, axis=-1)
         score = np.exp(-((error / STATIC_PX) ** 2) / 2)
         out[i] = np.where(mask[i] & ok[i] & np.isfinite(error), score, 0)
-    out[F - span :] = out[F - span - 1] if F > span else 0
+    out[F - span :] = out[F - span - 1] if span < F else 0
     return out

@@ -52,7 +52,8 @@ def render(s: State, config: FieldsConfig, count: int | None = None) -> Rendered
     shape = rest(kin, s.shape)
     last = len(s.obs.at) - 1
     pose = (s.q[0, :, 1:] / kin.sigma[1:].to(s.q.device)).flatten(1)
-    bones = skinning.bones(kin, s.body, s.R_root, s.q, torch.cat([s.seen, (s.seen + s.obs.span).clamp(max=last)]), shape)
+    both = torch.cat([s.seen, (s.seen + s.obs.span).clamp(max=last)])
+    bones = skinning.bones(kin, s.body, s.R_root, s.q, both, shape)
     r = rays.choose(s, config.rays if count is None else count)
     here, there = r.frame, r.frame + len(s.seen)
     own = bones.pick(here)
