@@ -50,7 +50,7 @@ def _observations(mask: torch.Tensor) -> Observations:
     return Observations(
         t=t, at=torch.arange(F), dt=torch.full((F - 1,), 0.1), K=K, scale=1.0, T_world_cam=np.stack([_camera(0.8)] * F),
         mask=mask, edge=torch.zeros(F, 1, K.height, K.width), draw_in=flat, draw_out=flat,
-        span=1, flow=torch.zeros(F - 1, n, 2), flow_ok=torch.ones(F - 1, n, dtype=torch.bool),
+        flow=torch.zeros(F - 1, n, 2), flow_ok=torch.ones(F - 1, n, dtype=torch.bool),
         static=torch.zeros(F, 1, K.height, K.width), quality=torch.ones(F), box=np.array([[40, 20, 90, 60.0]] * F),
         empty=np.zeros(F, bool), flow_size=1.0,
     )  # fmt: skip

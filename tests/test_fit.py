@@ -14,7 +14,6 @@ from slomo.reconstruct import hypotheses, silhouette
 from slomo.reconstruct.fit_stage import run_fit
 from slomo.reconstruct.hypotheses import GaitHypothesis
 from slomo.reconstruct.kinematics import Kinematics
-from slomo.reconstruct.observations import Observations, observe
 from slomo.reconstruct.refine_stage import ReconstructConfig, run_refine
 from slomo.rotation import umeyama
 from slomo.skeleton import load_skeleton
@@ -196,26 +195,6 @@ def test_masks_of_something_else_fail(walk):
     assert out.failure
     assert "silhouette_iou" in out.failure
     assert out.json["report.json"]["verdict"]["trust"] == "unusable"
-
-
-def test_flow_is_over_the_same_time_at_any_rate():
-    mask = np.zeros((12, 60, 80), bool)
-    mask[:, 20:50, 20:60] = True
-    masks = dict(packed=np.packbits(mask, axis=-1), shape=np.array(mask.shape), quality=np.ones(12))
-    right = np.zeros((11, 60, 80, 2), np.float16)
-    right[..., 0] = 1.5  # px a frame
-    flow = dict(flow=right, consistent=np.packbits(np.ones((11, 60, 80), bool), axis=-1))
-    camera = dict(K=np.diag([100.0, 100.0, 1.0]), T_world_cam=np.tile(_camera(), (12, 1, 1)))
-    slow, fast = (observe(np.arange(12) / 30, masks, flow, camera, fps=fps, subject_px=999) for fps in (15, 30))
-    assert (slow.span, fast.span) == (1, 2)
-    assert (len(slow.flow), len(fast.flow)) == (5, 10)
-    for obs in (slow, fast):
-        assert torch.allclose(obs.flow[obs.flow_ok], torch.tensor([3.0, 0.0]))
-    coarse = fast.coarse()
-    for f in dataclasses.fields(Observations):
-        if f.name != "K":
-            a, b = (np.asarray(getattr(obs, f.name), float) for obs in (coarse, slow))
-            np.testing.assert_allclose(a, b, rtol=1e-5, err_msg=f.name)
 
 
 def test_parts_that_disagree_are_refused(walk):

@@ -21,7 +21,7 @@ from slomo.stage import Arrays, Artifact, Inputs, Progress
 
 Array = np.ndarray
 
-VERSION = 6
+VERSION = 7
 MOST_FRAMES = 600  # that are looked at: each takes 3 MB, and long clips are not to take more than others
 
 PRIORS = ("auto", "none")
@@ -40,7 +40,7 @@ class Config:
 
     prior: str = "auto"
     skeleton: str = "quadruped"
-    fps: float = 15.0
+    fps: float = 30.0
 
     def __post_init__(self):
         if self.prior not in PRIORS:

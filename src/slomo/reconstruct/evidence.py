@@ -77,14 +77,6 @@ class Evidence:
         """The same with some groups silenced."""
         return replace(self, **{GROUPS[g]: torch.zeros_like(getattr(self, GROUPS[g])) for g in groups})
 
-    def every(self, n: int) -> "Evidence":
-        """The same at each n-th fit frame."""
-        by_frame = (
-            "unit", "view", "up", "view_weight", "path", "uv", "confidence", "box", "part", "chance", "parts_weight",
-            "seen", "capsule", "along", "normal", "sure",
-        )  # fmt: skip
-        return replace(self, **{k: getattr(self, k)[::n] for k in by_frame})
-
     def paths(self) -> list[tuple[str, Array]]:
         """Azimuths (F,) rad of the whole clip worth a hypothesis: the decided one, and each of its mirror images that
         the frames give some probability and that differs. Empty without a view."""

@@ -32,16 +32,18 @@ class Effort:
     phases_of_gait: int
 
 
-def fit(problem: Problem, root: RootGuess, effort: Effort, *, metres: float, seed: int, progress: Progress) -> Run:
-    """Fit from the root path to the winner: all frames are looked at in the last phase only.
+def fit(
+    problem: Problem, coarse: Problem, root: RootGuess, effort: Effort, *, metres: float, seed: int, progress: Progress
+) -> Run:
+    """Fit from the root path to the winner.
 
     Args:
+        coarse: the same problem at fewer frames, which all phases but the last look at.
         metres: wanted body length m, for Froude numbers.
         seed: of the draws and of the MLPs' first layers.
     """
     generator = torch.Generator().manual_seed(seed)
     run, start, adam_state = restore(progress.load(), generator)
-    coarse = problem.coarse()
     if run is None:
         run = _start(coarse, root, generator)
     total = total_cost(effort)

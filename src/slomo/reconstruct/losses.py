@@ -111,9 +111,9 @@ def misfit(s: State) -> Tensor:
 
 
 def flow(s: State) -> Tensor:
-    """Optical flow: the surface point that a mask pixel sees moves with its link to the fit frame a span later."""
+    """Optical flow: the surface point that a mask pixel sees moves with its link to the next fit frame."""
     obs, K = s.obs, s.obs.K
-    pairs = s.seen < len(obs.at) - obs.span
+    pairs = s.seen < len(obs.at) - 1
     k = s.seen[pairs]
     u, v, pixel = s.u[pairs][:, : s.inside], s.v[pairs][:, : s.inside], s.pixel[pairs][:, : s.inside]
     sub = Outline(**{f: getattr(s.out, f)[:, pairs] for f in Outline.__dataclass_fields__})
@@ -131,14 +131,14 @@ def flow(s: State) -> Tensor:
 
 
 def carry(s: State, k: Tensor, c: Tensor, X: Tensor) -> Tensor:
-    """(H, S, P, 2) px where camera-frame points X of frames k, fixed to capsules c, are seen a flow's span later."""
-    kin, body, later = s.kin, s.body, k + s.obs.span
+    """(H, S, P, 2) px where camera-frame points X of frames k, fixed to capsules c, are seen in frames k + 1."""
+    kin, body = s.kin, s.body
     H, S, P = c.shape
-    # Camera of frame k -> link -> camera of the later frame, composed per capsule before it is gathered per pixel.
+    # Camera of frame k -> link -> camera of frame k + 1, composed per capsule before it is gathered per pixel.
     R0 = s.R_cam[:, k][:, :, None] @ body.R[:, k][:, :, kin.c_link]
-    R1 = s.R_cam[:, later][:, :, None] @ body.R[:, later][:, :, kin.c_link]
+    R1 = s.R_cam[:, k + 1][:, :, None] @ body.R[:, k + 1][:, :, kin.c_link]
     R = R1 @ R0.transpose(-1, -2)
-    a0, a1 = s.ends[0][:, k], s.ends[0][:, later]
+    a0, a1 = s.ends[0][:, k], s.ends[0][:, k + 1]
     p = a1 - (R @ a0[..., None])[..., 0]
     Rg = torch.gather(R.reshape(H, S, -1, 9), 2, c[..., None].expand(H, S, P, 9)).reshape(H, S, P, 3, 3)
     pg = torch.gather(p, 2, c[..., None].expand(H, S, P, 3))

@@ -1,11 +1,11 @@
 """What the fit compares with: masks, distance transforms, chained flow and cameras, at a working resolution.
 
-Fit frames are every n-th frame of the clip. Flow is looked at over a fifteenth of a second, which may be several of
-them: between frames closer than that it is little more than noise. The flow of the frames between is chained.
+Fit frames are every n-th frame of the clip; the flow between two of them is the flow of the frames between, chained.
 """
 
+import itertools
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -14,12 +14,13 @@ import torch
 from slomo.errors import InvalidData
 from slomo.ground_path import mask_box
 from slomo.pinhole import Intrinsics, ground_points
-from slomo.prior.frames import SPAN, every, spread
+from slomo.prior.frames import every, spread
 
 Array = np.ndarray
 Tensor = torch.Tensor
 
 STATIC_PX = 0.35  # a pixel moves with the ground when its flow differs by about this many working pixels
+LONG_FPS = 15.0
 MOST_PIXELS = 30e6  # working pixels of all fit frames together, each of which takes about 40 bytes
 
 
@@ -33,7 +34,7 @@ class Observations:
         T_world_cam: (T, 4, 4) as given.
         mask: (F, n) bool; edge: (F, 1, h, w) px, signed distance to the mask's edge, positive outside.
         draw_in, draw_out: (F, n) cumulative probabilities for drawing mask and background pixels.
-        span: fit frames between the two pictures of a flow, S. flow: (F-S, n, 2) px; flow_ok: (F-S, n) bool.
+        flow: (F-1, n, 2) px; flow_ok: (F-1, n) bool.
         static: (F, 1, h, w) in [0, 1], how surely a mask pixel moves as a point of the ground there would.
         quality: (F,) in [0, 1]. box: (F, 4) u0, v0, u1, v1 px of the mask; empty: (F,) bool.
         flow_size: px, robust magnitude of the flow inside the mask.
@@ -49,7 +50,6 @@ class Observations:
     edge: Tensor
     draw_in: Tensor
     draw_out: Tensor
-    span: int
     flow: Tensor
     flow_ok: Tensor
     static: Tensor
@@ -57,16 +57,6 @@ class Observations:
     box: Array
     empty: Array
     flow_size: float
-
-    def coarse(self) -> "Observations":
-        """The same at fit frames a span of the flow apart."""
-        n = self.span
-        at = self.at[::n]
-        by_frame = ("mask", "edge", "draw_in", "draw_out", "static", "quality", "box", "empty")
-        return replace(
-            self, at=at, dt=self.t[at].diff(), span=1, flow=self.flow[::n][: len(at) - 1],
-            flow_ok=self.flow_ok[::n][: len(at) - 1], **{k: getattr(self, k)[::n] for k in by_frame},
-        )  # fmt: skip
 
 
 def unpack(packed: Array, shape: Array) -> Array:
@@ -82,7 +72,7 @@ def observe(
 
     Args:
         frames_t: (T,) s. masks, flow, camera: the arrays of the upstream artifacts.
-        fps: fit frames a second at most.
+        fps: fit frames a second at most; no more than `LONG_FPS` of a clip that would take too much memory.
         subject_px: wanted size of the subject (root of its area) in working pixels; never above the clip's own, and
             less where a long clip with a small subject would take too much memory (`MOST_PIXELS`).
 
@@ -94,12 +84,14 @@ def observe(
     if len(set(counts.values())) != 1:
         raise InvalidData(f"the parts disagree about the number of frames: {counts}", where="reconstruct")
     at = np.arange(0, T, every(frames_t, fps))
-    full = [unpack(masks["packed"][k], masks["shape"]) for k in at]
-    area = np.array([m.sum() for m in full])
+    area = np.array([unpack(masks["packed"][k], masks["shape"]).sum() for k in at])
     if not (area > 0).any():
         raise InvalidData("no frame shows the subject", where="masks", todo="give masks with --masks")
     scale = min(1.0, subject_px / float(np.sqrt(np.median(area[area > 0]))))
-    scale = min(scale, float(np.sqrt(MOST_PIXELS / (len(at) * height * width))))
+    if len(at) * height * width * scale**2 > MOST_PIXELS:
+        at = np.arange(0, T, every(frames_t, min(fps, LONG_FPS)))
+        scale = min(scale, float(np.sqrt(MOST_PIXELS / (len(at) * height * width))))
+    full = [unpack(masks["packed"][k], masks["shape"]) for k in at]
     w, h = max(16, round(width * scale)), max(16, round(height * scale))
     scale = w / width
     smaller = lambda x: cv2.resize(np.asarray(x, np.float32), (w, h), interpolation=cv2.INTER_AREA)  # noqa: E731
@@ -109,14 +101,12 @@ def observe(
     K = Intrinsics(
         K0[0, 0] * scale, K0[1, 1] * scale, (K0[0, 2] + 0.5) * scale - 0.5, (K0[1, 2] + 0.5) * scale - 0.5, w, h
     )
-    span = max(1, round(SPAN / float(np.median(np.diff(np.asarray(frames_t, float)[at]))))) if len(at) > 1 else 1
-    span = min(span, max(1, len(at) - 1))
-    fl, ok = np.empty((len(at) - span, h, w, 2), np.float32), np.empty((len(at) - span, h, w), bool)
-    for i, (first, last) in enumerate(zip(at[:-span].tolist(), at[span:].tolist(), strict=True)):
+    fl, ok = np.empty((len(at) - 1, h, w, 2), np.float32), np.empty((len(at) - 1, h, w), bool)
+    for i, (first, last) in enumerate(itertools.pairwise(at.tolist())):
         total, sure = _chain(flow, first, last, (width, height))
         fl[i], ok[i] = smaller(total) * scale, smaller(sure) > 0.7
     T_world_cam = np.asarray(camera["T_world_cam"], float)
-    static = _static(K, T_world_cam[at], mask, fl, ok, span)
+    static = _static(K, T_world_cam[at], mask, fl, ok)
     distance = lambda m: cv2.distanceTransform(m.astype(np.uint8), cv2.DIST_L2, 3)  # noqa: E731
     inside = np.stack([distance(m) for m in mask])
     outside = np.stack([distance(~m) if m.any() else np.zeros((h, w), np.float32) for m in mask])
@@ -125,13 +115,13 @@ def observe(
     # Thin parts (legs) are drawn as often as thick ones; background is drawn near the subject and everywhere.
     draw_in = _cumulative(m / (1 + i) for m, i in zip(mask, inside, strict=True))
     draw_out = _cumulative(_beside(m, o) for m, o in zip(mask, outside, strict=True))
-    size = np.linalg.norm(fl, axis=-1)[ok & mask[:-span]]
+    size = np.linalg.norm(fl, axis=-1)[ok & mask[:-1]]
     f = lambda x: torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)  # noqa: E731
     flat = lambda x: torch.as_tensor(np.ascontiguousarray(x)).reshape(len(x), h * w, *x.shape[3:])  # noqa: E731
     return Observations(
         t=f(frames_t), at=torch.as_tensor(at), dt=f(np.diff(np.asarray(frames_t)[at])), K=K, scale=scale,
         T_world_cam=T_world_cam, mask=flat(mask), edge=f(outside - inside)[:, None], draw_in=draw_in, draw_out=draw_out,
-        span=span, flow=flat(fl), flow_ok=flat(ok & mask[:-span]), static=f(static)[:, None],
+        flow=flat(fl), flow_ok=flat(ok & mask[:-1]), static=f(static)[:, None],
         quality=f(masks["quality"][at]) * f(~empty), box=box, empty=empty,
         flow_size=float(np.quantile(size, 0.5)) if len(size) else 1.0,
     )  # fmt: skip
@@ -171,18 +161,18 @@ def _at(image: Array, uv: Array) -> Array:
     return cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR)
 
 
-def _static(K: Intrinsics, T_world_cam: Array, mask: Array, flow: Array, ok: Array, span: int) -> Array:
-    """How surely each mask pixel moves with the ground under it; the last fit frames repeat the one before."""
+def _static(K: Intrinsics, T_world_cam: Array, mask: Array, flow: Array, ok: Array) -> Array:
+    """How surely each mask pixel moves with the ground under it; the last fit frame repeats the one before."""
     F, h, w = mask.shape
     v, u = np.mgrid[:h, :w].astype(float)
     out = np.zeros((F, h, w), np.float32)
-    for i in range(F - span):
+    for i in range(F - 1):
         X = ground_points(K, T_world_cam[i], u, v)
-        Y = (X - T_world_cam[i + span, :3, 3]) @ T_world_cam[i + span, :3, :3]
+        Y = (X - T_world_cam[i + 1, :3, 3]) @ T_world_cam[i + 1, :3, :3]
         z = np.maximum(Y[..., 2], 1e-6)
         moved = np.stack([K.fx * Y[..., 0] / z + K.cx - u, K.fy * Y[..., 1] / z + K.cy - v], -1)
         error = np.linalg.norm(flow[i] - moved, axis=-1)
         score = np.exp(-((error / STATIC_PX) ** 2) / 2)
         out[i] = np.where(mask[i] & ok[i] & np.isfinite(error), score, 0)
-    out[F - span :] = out[F - span - 1] if span < F else 0
+    out[-1] = out[-2] if F > 1 else 0
     return out

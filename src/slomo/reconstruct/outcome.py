@@ -148,7 +148,7 @@ def _overlap(problem: Problem, run: Run) -> tuple[float, float, Array]:
         covered = state.sd[0, 0].amin(-1) < 0
         union = (covered | obs.mask[f]).sum()
         ious.append(float((covered & obs.mask[f]).sum() / union) if union and not obs.empty[f] else np.nan)
-        if f >= len(obs.at) - obs.span or not inside.numel():
+        if f == len(obs.at) - 1 or not inside.numel():
             continue
         state = problem.state(run.x, run.guess, Draw(torch.tensor([f]), inside, inside.shape[1]), stance_weight=0.0)
         c, meets = silhouette.visible(obs.K, state.out, state.sd, state.h)

@@ -1,12 +1,12 @@
 """The fitting problem: variables of H hypotheses, the draw of pixels, the weighted sum of the evidence, and Adam."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 
-from slomo.reconstruct import evidence_terms, losses, silhouette
+from slomo.reconstruct import losses, silhouette
 from slomo.reconstruct.evidence import Evidence
 from slomo.reconstruct.kinematics import Kinematics, rot
 from slomo.reconstruct.observations import Observations
@@ -43,14 +43,6 @@ class Problem:
     tilt_spread: float
     terms: Mapping[str, losses.Term] = field(default_factory=lambda: losses.TERMS)
     said: Evidence | None = None
-
-    def coarse(self) -> "Problem":
-        """The same at fewer fit frames, a span of the flow apart: enough to choose between hypotheses."""
-        if self.obs.span == 1:
-            return self
-        said = self.said.every(self.obs.span) if self.said else None
-        terms = {**self.terms, **(evidence_terms.terms(said) if said else {})}
-        return replace(self, obs=self.obs.coarse(), said=said, terms=terms)
 
     def variables(self, H: int, generator: torch.Generator) -> Variables:
         shape = {f"shape.{k}": v for k, v in self.kin.shape_variables(H).items()}

@@ -20,7 +20,7 @@ class Rendered:
 
     Attributes:
         opacity: (R,). colour: (R, 3), of the body alone times its opacity. depth: (R,) body lengths, mean.
-        flow: (R, 2) px over the flow's span; rows of the last fit frames are meaningless.
+        flow: (R, 2) px to the next fit frame; rows of the last fit frame are meaningless.
         canonical: (R, n, 3) the samples at rest. residual: (R, n) what the network adds to the capsules' distance.
         weight: (R, n), sum to the opacity. delta: mean square of what the delta network adds to the skinning.
         queried: (R, Q, 3) samples with the largest weights, at rest; cycle: (R, Q) squared distance, body lengths,
@@ -52,8 +52,7 @@ def render(s: State, config: FieldsConfig, count: int | None = None) -> Rendered
     shape = rest(kin, s.shape)
     last = len(s.obs.at) - 1
     pose = (s.q[0, :, 1:] / kin.sigma[1:].to(s.q.device)).flatten(1)
-    both = torch.cat([s.seen, (s.seen + s.obs.span).clamp(max=last)])
-    bones = skinning.bones(kin, s.body, s.R_root, s.q, both, shape)
+    bones = skinning.bones(kin, s.body, s.R_root, s.q, torch.cat([s.seen, (s.seen + 1).clamp(max=last)]), shape)
     r = rays.choose(s, config.rays if count is None else count)
     here, there = r.frame, r.frame + len(s.seen)
     own = bones.pick(here)
@@ -82,7 +81,7 @@ def render(s: State, config: FieldsConfig, count: int | None = None) -> Rendered
     back = skinning.forward(skinning.blend(w_rest, own.dual), asked)
     moved = skinning.forward(skinning.blend(w_rest, bones.dual[there]), asked)
     share = top / top.sum(1, keepdim=True).clamp(min=1e-6)
-    u, v = _seen(s, moved, (s.seen[here] + s.obs.span).clamp(max=last))
+    u, v = _seen(s, moved, (s.seen[here] + 1).clamp(max=last))
     uv = torch.stack([(share * u).sum(1), (share * v).sum(1)], -1)
     drawn = r.chosen[r.column]
     return Rendered(

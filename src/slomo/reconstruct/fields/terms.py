@@ -79,10 +79,10 @@ class Fields:
         return (miss + extra)[None]
 
     def flow(self, s: State) -> Tensor:
-        """Rendered flow over its span against the optical flow; robust as `losses.flow`."""
+        """Rendered flow to the next fit frame against the optical flow; robust as `losses.flow`."""
         r = self.rendered(s)
         k, pixel, quality = self._pixels(s, r)
-        use = (k < len(s.obs.at) - s.obs.span) & (r.rays.column < r.rays.inside)
+        use = (k < len(s.obs.at) - 1) & (r.rays.column < r.rays.inside)
         k, pixel, quality = k[use], pixel[use], quality[use]
         error = ((r.flow[use] - s.obs.flow[k, pixel]).square().sum(-1) + FLOW_PX**2).sqrt() - FLOW_PX
         size = 2.0 + s.obs.flow_size
