@@ -146,7 +146,7 @@ def inputs(**files):
 
 
 def run(config=None, progress=None, **files):
-    done = stage.run(inputs(**files), config or stage.Config(), progress or Silent())
+    done = stage.run(inputs(**files), config or stage.Config(fps=15.0), progress or Silent())
     return done.npz["evidence.npz"], done.json["report.json"]
 
 
