@@ -258,7 +258,7 @@ def test_the_user_s_points_come_back_where_they_were_given(tmp_path):
         ],
     )
     notes = Notes()
-    arrays, report = run(stage.Config(prior="none"), notes, keypoints2d=points)
+    arrays, report = run(stage.Config(prior="none", fps=15.0), notes, keypoints2d=points)
     assert arrays["keypoint_names"].tolist() == ["nose", "front_left_paw"]
     assert arrays["frame"].tolist() == [0, 2, 4, 8, 10, 12, 14, 16, 18]
     half = lambda p: (p + 0.5) / 2 - 0.5  # noqa: E731
