@@ -32,24 +32,20 @@ class Effort:
     phases_of_gait: int
 
 
-def fit(
-    problem: Problem, coarse: Problem, root: RootGuess, effort: Effort, *, metres: float, seed: int, progress: Progress
-) -> Run:
+def fit(problem: Problem, root: RootGuess, effort: Effort, *, metres: float, seed: int, progress: Progress) -> Run:
     """Fit from the root path to the winner.
 
     Args:
-        coarse: the same problem at fewer frames, which all phases but the last look at.
         metres: wanted body length m, for Froude numbers.
         seed: of the draws and of the MLPs' first layers.
     """
     generator = torch.Generator().manual_seed(seed)
     run, start, adam_state = restore(progress.load(), generator)
     if run is None:
-        run = _start(coarse, root, generator)
+        run = _start(problem, root, generator)
     total = total_cost(effort)
     while True:
         schedule = effort.schedules[run.phase]
-        now = problem if run.phase == len(PHASES) - 1 else coarse
         done = sum(s.iterations * _cost(s) for s in effort.schedules[: run.phase])
 
         def each(i: int, optimiser: torch.optim.Adam, loss: Tensor, run=run, schedule=schedule, done=done) -> None:
@@ -58,9 +54,11 @@ def fit(
             if progress.checkpoint_due():
                 progress.save(checkpoint(run, i, optimiser, generator))
 
-        run.x = optimise(now, run.x, run.guess, schedule, generator, start=start, adam_state=adam_state, each=each)
+        run.x = optimise(
+            problem, run.x, run.guess, schedule, generator, start=start, adam_state=adam_state, each=each
+        )  # fmt: skip
         start, adam_state = 0, None
-        losses = rank(now, run.x, run.guess)
+        losses = rank(problem, run.x, run.guess)
         run.log[PHASES[run.phase]] = [
             label | {"loss": round(float(v), 4)} for label, v in zip(run.labels, losses, strict=True)
         ]
@@ -69,7 +67,7 @@ def fit(
             run.log["final"] = [run.log["final"][int(k)] for k in order]
             best = order[:1]
             return Run(run.phase, _pick(run.x, best), run.guess.pick(best), [run.labels[int(best)]], run.log)
-        run = (_to_gait, _to_rivals, _to_final)[run.phase](now, run, losses, root, effort, metres, progress)
+        run = (_to_gait, _to_rivals, _to_final)[run.phase](problem, run, losses, root, effort, metres, progress)
 
 
 def polish(problem: Problem, run: Run, schedule: Schedule, *, seed: int, progress: Progress) -> Run:

@@ -23,7 +23,6 @@ from slomo.stage import Artifact, Inputs, Progress
 
 FIT_VERSION = 10
 
-SEARCH_FPS = 15.0  # fit frames a second at most until the last phase
 POLISH = 0.4  # share of the rates with which the chunks of a long clip are polished together
 
 # Of the heading, gait, rivals and final phase.
@@ -155,10 +154,7 @@ def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
     made = prepare(inputs, config)
     where = chunks.bounds(made.problem.obs.t.numpy().astype(float))
     with one_thread():
-        if len(where) == 1:
-            run = _search(made, _coarse(inputs, made, config), config, progress)
-        else:
-            run = _long(inputs, made, where, config, progress)
+        run = _search(made, config, progress) if len(where) == 1 else _long(inputs, made, where, config, progress)
     report: dict[str, Any] = {
         "hypothesis": run.labels[0], "loss": run.log["final"][0]["loss"], "search": run.log,
         "skeleton": made.skeleton.name, "camera_mode": made.camera_mode, "evidence": made.evidence,
@@ -167,16 +163,9 @@ def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
     return Artifact(npz={"fit.npz": as_arrays(run)}, json={"report.json": report})
 
 
-def _coarse(inputs: Inputs, made: Prepared, config: FitConfig) -> Prepared:
-    """The same at the search's rate."""
-    return prepare(inputs, replace(config, fps=SEARCH_FPS)) if config.fps > SEARCH_FPS else made
-
-
-def _search(made: Prepared, coarse: Prepared, config: FitConfig, progress: Progress) -> Run:
+def _search(made: Prepared, config: FitConfig, progress: Progress) -> Run:
     root = hypotheses.root_guess(made.problem.obs, made.skeleton)
-    return fitting.fit(
-        made.problem, coarse.problem, root, _effort(config), metres=made.metres, seed=config.seed, progress=progress
-    )
+    return fitting.fit(made.problem, root, _effort(config), metres=made.metres, seed=config.seed, progress=progress)
 
 
 def _long(
@@ -186,10 +175,9 @@ def _long(
     progress.note(f"fit: a long clip, in {len(where)} chunks that overlap")
     runs = chunks.finished(progress)
     while len(runs) < len(where):
-        cut = chunks.cut(inputs, *where[len(runs)])
-        part = prepare(cut, config)
-        fine, coarse = (replace(p, problem=chunks.level(p.problem)) for p in (part, _coarse(cut, part, config)))
-        runs.append(_search(fine, coarse, config, chunks.ChunkProgress(progress, runs, len(where))))
+        part = prepare(chunks.cut(inputs, *where[len(runs)]), config)
+        part = replace(part, problem=chunks.level(part.problem))
+        runs.append(_search(part, config, chunks.ChunkProgress(progress, runs, len(where))))
     paths = [_path(made.problem.obs.t[a:b], made.problem.kin, config) for a, b in where]
     joined = chunks.join(made.problem, paths, runs, where)
     schedule = replace(_effort(config).schedules[-1], rate=POLISH)
