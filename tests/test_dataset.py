@@ -90,6 +90,24 @@ def test_creatures_stand_on_the_ground_and_keep_their_bones(kind):
         assert np.allclose(bones, np.linalg.norm(c.offset[1:], axis=1), atol=1e-9)
 
 
+
+def test_heads_are_carried_high_and_low_and_turned_aside():
+    skeleton = load_skeleton("quadruped")
+    node = skeleton.names.index
+    high, aside = [], []
+    for seed in range(60):
+        c = create(skeleton, seed)
+        m = move(c, np.linspace(0, 1, 3), np.random.default_rng(seed))
+        if m.name not in {g.name for g in skeleton.gaits}:
+            continue
+        high.append(m.nodes[1, node("head"), 2] - m.nodes[1, node("withers"), 2])
+        turned = m.R[1, node("pelvis")].T @ m.R[1, node("head")][:, 0]
+        aside.append(abs(np.arctan2(turned[1], turned[0])))
+    assert np.mean(np.array(high) < 0.1) > 0.15
+    assert np.mean(np.array(high) > 0.25) > 0.15
+    assert np.mean(np.array(aside) > np.radians(40)) > 0.15
+
+
 def test_the_labels_agree(shard):
     known, z = shard
     assert np.array_equal(z["parts"] > 0, z["mask"] > 0)
