@@ -20,13 +20,11 @@ from slomo.skeleton import Skeleton
 Array = np.ndarray
 
 GRID = 64  # side of the dense arrays that are kept
-# What one frame is believed of the sides of a pair's joints. A network has about three quarters right in a clip that it
-# has not learnt from, but those that it has wrong are so together, from one crossing of the legs to the next: believed
-# one by one, they outweigh a motion that goes on as it was going. People are as often seen from behind as from the front
-# by a network that errs for a whole clip: nothing is made of their sides.
-SIDE = {"quadruped": 0.6}
+# Share of the joints of a pair whose sides a network has right in a clip it has not learnt from. People are as often
+# seen from behind as from the front by a network that errs for a whole clip: nothing is made of their sides.
+SIDE = {"quadruped": 0.75}
 NO_SIDE = 0.5
-MODEL_SIDE = 0.6  # of a model of the user's, likewise
+MODEL_SIDE = 0.75  # of a model of the user's, likewise
 _REACH = 0.012  # of the box's side: flow is averaged over this around a key point
 
 

@@ -67,7 +67,7 @@ class FitConfig:
     weight_stance: float = 0.5
     weight_ground: float = 0.3
     weight_limits: float = 0.05
-    weight_smooth: float = 0.02
+    weight_smooth: float = 0.03
     weight_forward: float = 0.25
     weight_balance: float = 0.01
     weight_prior: float = 0.05
