@@ -187,11 +187,6 @@ def test_the_horizon_grows_with_the_robot():
     assert resolved(Config(horizon=5), robot_of("g1")).horizon == 5
 
 
-def test_the_rate_is_the_kinds_unless_chosen():
-    assert [resolved(Config(), robot_of(name)).mpc_hz for name in ("go1", "g1")] == [250, 100]
-    assert resolved(Config(mpc_hz=50), robot_of("go1")).mpc_hz == 50
-
-
 def test_a_stand_arrives_however_far_the_hands_are():
     """Half-way through its inverse kinematics TALOS had a hand 18 cm off, or stood on the edge of a sole."""
     robot = robot_of("talos")

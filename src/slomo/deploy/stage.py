@@ -20,7 +20,6 @@ from slomo.store.digest import digest_arrays
 from slomo.terrain import Terrain
 from slomo.track import metrics
 from slomo.track import stage as tracking
-from slomo.track.config import resolved
 from slomo.track.joint_space import JointSpace
 from slomo.track.recording import reference_at
 
@@ -85,7 +84,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
             report["estimated"] = metrics.errors(_motion_only(estimated, end))
         errors = metrics.errors(_motion_only(rollout, end))
         ratio = {k: None if x is None or not tracked.get(k) else x / tracked[k] for k, x in errors.items()}
-        report |= errors | metrics.solver(rollout, period=1 / resolved(track, robot).mpc_hz)
+        report |= errors | metrics.solver(rollout, period=1 / track.mpc_hz)
         report |= {"state": "truth of the twin" if on_twin else "estimated", "over_track": ratio}
         files = {"rollout.npz": rollout.to_arrays()}
     return Artifact(

@@ -99,7 +99,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
         **metrics.estimate(rollout),
         **metrics.joints(rollout, robot, torque_ratio=outcome.torque_ratio, lookahead=config.lookahead),
         **metrics.contact_timing(rollout, outcome.reference),
-        **metrics.solver(rollout, period=1 / resolved(config, robot).mpc_hz),
+        **metrics.solver(rollout, period=1 / config.mpc_hz),
         "state": config.state,
         "fall": outcome.fall,
         "simulated_seconds": float(rollout.t[-1] - rollout.t[0]),
@@ -117,8 +117,7 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
 def _method(config: Config, robot: Robot) -> str:
     """In words, what ran."""
     layers = {"ik": "inverse kinematics + PD + J^T forces", "qp": "whole-body QP + PD"}
-    full = resolved(config, robot)
-    planner = f"{config.controller} (H = {full.horizon}, {full.mpc_hz} Hz)"
+    planner = f"{config.controller} (H = {resolved(config, robot).horizon}, {config.mpc_hz} Hz)"
     return f"{planner}, {layers[layer_of(config, robot.kind)]}, {config.state} state, MuJoCo"
 
 

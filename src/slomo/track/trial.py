@@ -15,7 +15,7 @@ from slomo.robot import Robot
 from slomo.stage import Progress
 from slomo.terrain import Box, Terrain
 from slomo.track import metrics
-from slomo.track.config import Config, resolved
+from slomo.track.config import Config
 from slomo.track.disturbance import Disturbance, Push
 from slomo.track.loop import Outcome, simulate
 
@@ -156,7 +156,7 @@ def run_trial(
         robot, reference, terrain=terrain, config=config, disturbance=world.disturbance, progress=progress,
         world=world.ground, reference_digest=reference_digest,
     )  # fmt: skip
-    times = metrics.solver(outcome.rollout, period=1 / resolved(config, robot).mpc_hz)
+    times = metrics.solver(outcome.rollout, period=1 / config.mpc_hz)
     result = Result(
         controller=config.controller, row=row, number=number, fall=outcome.fall, end=float(outcome.rollout.t[-1]),
         **metrics.errors(outcome.rollout), mpc_ms_p50=times["mpc_ms_p50"], mpc_ms_p99=times["mpc_ms_p99"],
