@@ -67,7 +67,7 @@ def test_the_cat_walks_for_a_minute():
 
 @pytest.mark.slow
 def test_a_push_finds_the_cat_on_all_its_feet():
-    """Legs that bear load have to step: with a tick every 10 ms the plan came too late, and it fell in half a second."""
+    """Legs that bear load have to step: with a tick every 10 ms the plan came too late, and it fell."""
     inputs = planned("cat00")
     optimized = inputs.artifacts["optimize"]
     found = run_trial(
@@ -85,7 +85,7 @@ def test_a_push_finds_the_cat_on_all_its_feet():
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 3])
 def test_jumping_jacks(seed):
-    """They begin on the heels, from which it fell backwards with a tick every 10 ms (of these seeds with the first)."""
+    """They begin on the heels, from which the G1 fell backwards (with the first seed) at a tick every 10 ms."""
     artifact = track.run(planned("human_jumping_jack", to="g1"), track.Config(sensor_seed=seed), Silent())
     assert artifact.failure is None
     assert artifact.json["metrics.json"]["body_rmse"] < 0.06
