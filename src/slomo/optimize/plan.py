@@ -37,7 +37,7 @@ SOLVERS = {
 }
 ATTEMPTS = 10
 _WEAKER, _SLOWER = 4, 1.15  # attempts with limited forces before the motion is slowed down, and by what each time
-_PATIENCE = 2  # rounds without convergence after which a solve that started from a solution gives up
+_PATIENCE = 4  # rounds without progress after which a solve that started from a solution gives up
 _CALMER = 4.0  # on the weight of the trunk's angular acceleration
 
 
@@ -123,10 +123,10 @@ def make_plan(
         task, it = make_task(want, wish.steps), solution.iterate
         solution = solve(task, it._replace(us=np.column_stack([it.us, task.u_ref[:, -1]])))
     settings, why, best, overloaded = wish.settings, "targets", None, 0
-    slower, good = 1.0, None  # factor on times; the last solution that converged, and its factor
+    slower, good = 1.0, None  # factor on times; the last solution that converged, its task and its factor
     while True:
         if solution.converged:
-            good = solution.iterate, slower
+            good = solution.iterate, task, slower
         attempts.append(f"{why}: {solution.status}, start {solution.start!r}, {solution.iterations} steps")
         reference = _reference(robot, model, task, solution)
         joints = joint_motion(robot, reference)
@@ -140,9 +140,9 @@ def make_plan(
             break
         remedies, calmer = [], False
         if not (solution.converged or good is None or wish.cyclic):
-            # What it ended with says little. The limits leave no motion near the last one: at less speed they may.
+            # What it ended with says little. The new limits leave no motion nearby; those of a slower one may.
+            task, calmer = good[1], True
             remedies.append("back to the last motion that converged")
-            calmer = True
         else:
             if "slip_per_second" in wrong and not settings.strict:
                 settings = replace(settings, strict=True)
@@ -172,7 +172,7 @@ def make_plan(
             break
         why = " and ".join(remedies)
         report(0.0, why)
-        it, pace = (solution.iterate, slower) if good is None else good
+        it, _, pace = (solution.iterate, task, slower) if good is None else good
         solution = solve(task, it._replace(vs=it.vs * pace / slower), settings)
     _, reference, checks, solution = best
     return Plan(reference, checks, want, solution, tuple(attempts), scale, cycle, seconds)

@@ -44,7 +44,8 @@ class Settings:
         end_tolerance: m, rad, m/s, rad/s, of the end of a cyclic motion.
         rounds: of the augmented Lagrangian (and of moving the ground) at the last kappa.
         most_iterations: in all, from one start.
-        patience: rounds in a row at the last kappa that end without convergence, after which a start is given up.
+        patience: rounds in a row at the last kappa without progress, after which a start is given up: Newton steps ran
+            out, or violations did not halve, as where limits contradict each other.
         strict: whether loaded points may not slide at all, instead of at a cost.
         starts: most starts that are tried.
     """
@@ -230,7 +231,7 @@ def _descend(
             iterations += count
             if status == ddp.NOT_FINITE:
                 raise StageFailed("met numbers that are not finite", where="optimize", todo="check the key points")
-            worst = multipliers.update(body, task, it, s)
+            before, worst = multipliers.previous, multipliers.update(body, task, it, s)
             ground = np.ascontiguousarray(terrain.planes(it.qs[:, 7:].reshape(len(it.qs), -1, 3)))
             moved = differs(task, ground, it)
             new = strict and np.any(_normal_forces(task, it)[~task.stick] > LOADED)
@@ -240,7 +241,8 @@ def _descend(
             if moved:
                 failure = failure or "feet keep crossing an edge of the terrain"
                 task = task._replace(ground=ground)
-            failed = failed + 1 if last and status != ddp.CONVERGED else 0
+            nothing = status != ddp.CONVERGED or worst > max(1.0, 0.5 * before)
+            failed = failed + 1 if last and nothing else 0
             if iterations >= s.most_iterations or failed >= s.patience:
                 failure = failure or ddp.STATUS[ddp.ITERATIONS]
                 break
