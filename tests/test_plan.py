@@ -7,10 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slomo.motion import Reference
-from slomo.optimize import feedback, plan, stage
+from slomo.optimize import feedback, plan, problem, stage
 from slomo.optimize.inverse import JointMotion, joint_motion
 from slomo.optimize.load import load_excess
 from slomo.optimize.reach import reach_excess
+from slomo.optimize.solve import Settings, solve
 from slomo.pointfoot import PointFootModel
 from slomo.robot import load_robot
 from slomo.stage import Artifact, Inputs, Silent
@@ -114,3 +115,36 @@ def test_a_motion_that_no_force_limit_saves_is_slowed_down_and_says_so():
     assert report["dynamics_residual"] < 1e-9
     assert report["verified"] == (out.failure is None)
     assert PointFootModel.from_robot(weak).total_mass == pytest.approx(MODEL.total_mass)
+
+
+def test_after_an_attempt_that_did_not_converge_the_next_is_slower_and_starts_from_the_last_that_did(monkeypatch):
+    real, starts, solutions = plan._solver("ddp"), [], []
+
+    def solver(model, task, start, **how):
+        solution = real(model, task, start, **how)
+        if len(solutions) == 1:
+            solution = replace(solution, status="iteration limit")
+        starts.append(start)
+        solutions.append(solution)
+        return solution
+
+    monkeypatch.setattr(plan, "_solver", lambda name: solver)
+    monkeypatch.setattr(plan, "ATTEMPTS", 3)
+    weak = replace(ROBOT, effort=0.15 * ROBOT.effort)
+    source = Artifact(npz={"keypoints.npz": trot(speed=0.8).to_arrays()}, json={"terrain.json": Terrain().to_json()})
+    report = stage.run(Inputs({"retarget": source}, robot=weak), stage.Config(), Silent()).json["report.json"]
+    assert "back to the last motion that converged" in report["attempts"][2]
+    first, again = solutions[0].iterate, starts[2]
+    assert np.array_equal(again.qs, first.qs)
+    assert again.vs * 1.15 == pytest.approx(first.vs)
+    assert "slowed down to 87 %" in report["attempts"][2]
+
+
+def test_an_attempt_that_gets_nowhere_is_given_up():
+    source = trot(speed=0.8)
+    want = problem.targets(source, MODEL, Terrain(), dt=0.05)
+    task = problem.make_task(MODEL, want, Terrain(), problem.Weights())
+    start = problem.make_start(MODEL, want, task)
+    settings = Settings(kappas=(1e-4,), iterations=1, starts=1, patience=2)
+    solution = solve(MODEL, task, start, terrain=Terrain(), settings=settings)
+    assert (solution.status, solution.iterations) == ("iteration limit", 2)

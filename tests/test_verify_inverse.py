@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from references import carrying, follow, standing
 from slomo.motion import Reference
 from slomo.optimize import problem
-from slomo.optimize.inverse import joint_motion
+from slomo.optimize.inverse import Legs, joint_motion
 from slomo.pointfoot import PointFootModel
 from slomo.robot import load_robot
 
@@ -194,3 +194,22 @@ def test_what_joints_can_reach_is_reached(name, share):
             u=np.zeros((1, 3 * C)), lam=np.zeros((1, C, 3)), point_names=robot.foot_names, robot_digest="",
         )  # fmt: skip
         assert joint_motion(robot, r).miss.max() < 1e-4
+
+
+def test_a_limb_comes_back_from_its_limits_when_its_points_do():
+    """A foot that starts turned backwards leads its leg into another minimum; what comes next is reached."""
+    robot = load_robot("g1")
+    legs = Legs(robot)
+    x, _ = seen_from_outside(robot, robot.q_nominal, np.zeros(robot.model.nv))
+    root, nominal = legs.root(x, np.zeros(6))[:7], x[7:].reshape(-1, 3)
+    toe, heel = (list(robot.foot_names).index(n) for n in ("right_toe", "right_heel"))
+    foot = [toe, heel]
+    middle = nominal[foot].mean(axis=0)
+    points = np.tile(nominal, (12, 1, 1))
+    for k, angle in enumerate(np.linspace(-np.pi, 0.0, 12)):
+        turned = Rotation.from_rotvec([0, 0, angle]).apply(nominal[foot] - middle)
+        points[k, foot] = middle + [0.1, 0.0, 0.0] + turned
+    home = np.tile(robot.q_nominal[7:], (12, 1))
+    _, error = legs.sweep(np.tile(root, (12, 1)), points, home, np.full(12, 0.9))
+    assert np.abs(error[0]).max() > 0.03
+    assert np.abs(error[-3:]).max() < 1e-4

@@ -8,14 +8,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slomo.motion import Reference
-from slomo.optimize.inverse import JointMotion
+from slomo.optimize.inverse import MISSED, JointMotion
 from slomo.optimize.load import JointLoad
 from slomo.optimize.reach import Reach
 from slomo.robot import Robot
 
 _LOADED = 0.97  # of a joint's limits that is planned with
 _SINGULAR = 0.1  # of the usual size of the Jacobian: directions in which a limb moves less say nothing of its joints
-_MISSED, _MARGIN = 1e-3, 1e-3  # m from which on a miss counts, and by how much less than was reached is asked for
+_MARGIN = 1e-3  # m by how much less than was reached is asked for
 _NEIGHBOURS = 2  # knots to either side of one that missed that are limited with it
 
 
@@ -74,7 +74,7 @@ def reach(robot: Robot, joints: JointMotion, reference: Reference) -> Reach:
     )
     normal, most = np.zeros((T, len(limbs), C, 3)), np.full((T, len(limbs)), np.inf)
     for m, points in enumerate(limbs):
-        missed = np.flatnonzero(joints.miss[:, points].max(axis=1) > _MISSED)
+        missed = np.flatnonzero(joints.miss[:, points].max(axis=1) > MISSED)
         for k in range(T):
             # What is taken away from one knot must not come back at the next.
             near = missed[np.abs(missed - k) <= _NEIGHBOURS]

@@ -33,6 +33,7 @@ FLAT = 0.01  # m/rad, of a foot's tilt about the line from heel to toe: gives wa
 LARGEST_STEP = 0.5  # rad
 STILL = 1e-4  # rad, a step after which the iteration ends
 ITERATIONS = 30
+MISSED = 1e-3  # m, a point farther away than this was missed
 PULL = np.minimum(1.0, 0.7 ** (np.arange(ITERATIONS) - 8))  # home gives way at last: with limits it can go in circles
 RETURN = 0.5  # s in which redundant joints come back to their nominal angles
 SMOOTHING = 0.3  # s, of the redundant joints' home in the second pass
@@ -164,14 +165,23 @@ class Legs:
     def sweep(self, root: Array, points: Array, home: Array, keep: Array) -> tuple[Array, Array]:
         """`solve` at every knot, each from the one before: joints (T, nj) rad and what is missing (T, C, 3) m.
 
+        A limb that was once led to a limit (a foot turned backwards) would stay there, in a minimum of its own, long
+        after its points are within reach: what is missed is tried from the nominal angles too.
+
         Args:
             home: (T, nj) rad.  keep: (T,) share of the last knot's angles in the home of each.
         """
         joints, error = np.empty(home.shape), np.empty(points.shape)
         last = home[0]
         for k in range(len(root)):
-            last = joints[k] = self.solve(root[k], last, points[k], keep[k] * last + (1 - keep[k]) * home[k])
+            aim = keep[k] * last + (1 - keep[k]) * home[k]
+            last = joints[k] = self.solve(root[k], last, points[k], aim)
             error[k] = self.error[: points[k].size].reshape(-1, 3)
+            if np.abs(error[k]).max() > MISSED:
+                again = self.solve(root[k], self.robot.q_nominal[7:], points[k], aim)
+                other = self.error[: points[k].size].reshape(-1, 3)
+                if np.linalg.norm(other) < 0.5 * np.linalg.norm(error[k]):
+                    last, joints[k], error[k] = again, again, other
         return joints, error
 
     def solve(self, root: Array, joints: Array, points: Array, home: Array, *, iterations: int = ITERATIONS) -> Array:

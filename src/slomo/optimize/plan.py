@@ -20,7 +20,6 @@ from slomo.optimize.cycle import close, end_shift, find_cycle
 from slomo.optimize.inverse import joint_motion
 from slomo.optimize.iterate import Iterate
 from slomo.optimize.problem import Steps, Targets, Weights
-from slomo.optimize.reach import Reach
 from slomo.optimize.scale import best_scale
 from slomo.optimize.solve import Report, Settings, Solution
 from slomo.optimize.verify import verify
@@ -38,6 +37,7 @@ SOLVERS = {
 }
 ATTEMPTS = 10
 _WEAKER, _SLOWER = 4, 1.15  # attempts with limited forces before the motion is slowed down, and by what each time
+_PATIENCE = 4  # rounds without progress after which a solve that started from a solution gives up
 _CALMER = 4.0  # on the weight of the trunk's angular acceleration
 
 
@@ -108,7 +108,7 @@ def make_plan(
             start = problem.make_start(model, want, task)
         else:
             # From a solution: other starts, which come from it too, have nothing to add.
-            settings = replace(settings, kappas=settings.kappas[-2:], starts=1)
+            settings = replace(settings, kappas=settings.kappas[-2:], starts=1, patience=_PATIENCE)
         solution = run(model, task, start, terrain=terrain, settings=settings, report=report)
         seconds += solution.seconds
         return solution
@@ -123,7 +123,10 @@ def make_plan(
         task, it = make_task(want, wish.steps), solution.iterate
         solution = solve(task, it._replace(us=np.column_stack([it.us, task.u_ref[:, -1]])))
     settings, why, best, overloaded = wish.settings, "targets", None, 0
+    slower, good = 1.0, None  # factor on times; the last solution that converged, its task and its factor
     while True:
+        if solution.converged:
+            good = solution.iterate, task, slower
         attempts.append(f"{why}: {solution.status}, start {solution.start!r}, {solution.iterations} steps")
         reference = _reference(robot, model, task, solution)
         joints = joint_motion(robot, reference)
@@ -135,37 +138,42 @@ def make_plan(
             best = badness, reference, checks, solution
         if wish.solver != "ddp" or len(attempts) >= ATTEMPTS or not wrong:
             break
-        remedies = []
-        if "slip_per_second" in wrong and not settings.strict:
-            settings = replace(settings, strict=True)
-            remedies.append("loaded feet made to stick")
-        if "joint_miss" in wrong:
-            more = feedback.reach(robot, joints, reference)
-            old = task.reach if task.reach.most.size else Reach(more.normal[:, :0], more.most[:, :0])
-            task = task._replace(reach=Reach(*(np.concatenate(x, axis=1) for x in zip(old, more, strict=True))))
-            remedies.append("less room where joint limits kept a point back")
-        if wrong & {"torque_ratio", "speed_ratio"}:
-            overloaded += 1
-            task = task._replace(load=feedback.torques(robot, joints, reference))
-            remedies.append("forces limited where joints were overloaded")
-            if "speed_ratio" in wrong or task.speed.most.size:
-                task = task._replace(speed=feedback.speeds(robot, joints, reference))
-                remedies.append("velocities where they were too fast")
-            if feedback.trunk_overloaded(robot, joints):
-                task = task._replace(w_spin=_CALMER * task.w_spin)
-                remedies.append("a calmer trunk")
-            if overloaded > _WEAKER and not wish.cyclic:
+        remedies, calmer = [], False
+        if not (solution.converged or good is None or wish.cyclic):
+            # What it ended with says little. The new limits leave no motion nearby; those of a slower one may.
+            task, calmer = good[1], True
+            remedies.append("back to the last motion that converged")
+        else:
+            if "slip_per_second" in wrong and not settings.strict:
+                settings = replace(settings, strict=True)
+                remedies.append("loaded feet made to stick")
+            if "joint_miss" in wrong:
+                task = task._replace(reach=task.reach.joined(feedback.reach(robot, joints, reference)))
+                remedies.append("less room where joint limits kept a point back")
+            if wrong & {"torque_ratio", "speed_ratio"}:
+                overloaded += 1
+                task = task._replace(load=feedback.torques(robot, joints, reference))
+                remedies.append("forces limited where joints were overloaded")
+                if "speed_ratio" in wrong or task.speed.most.size:
+                    task = task._replace(speed=feedback.speeds(robot, joints, reference))
+                    remedies.append("velocities where they were too fast")
+                if feedback.trunk_overloaded(robot, joints):
+                    task = task._replace(w_spin=_CALMER * task.w_spin)
+                    remedies.append("a calmer trunk")
                 # Forces alone do not help: it is the motion that asks too much.
-                slower = _SLOWER ** (overloaded - _WEAKER)
-                slow = make_task(replace(want, t=slower * want.t, v=want.v / slower), wish.steps)
-                known = {name: getattr(task, name) for name in ("ground", "w_spin", "load", "speed", "reach")}
-                task = slow._replace(**known)
-                remedies.append(f"the motion slowed down to {100 / slower:.0f} %")
+                calmer = overloaded > _WEAKER
+        if calmer and not wish.cyclic:
+            slower *= _SLOWER
+            slow = make_task(replace(want, t=slower * want.t, v=want.v / slower), wish.steps)
+            known = {name: getattr(task, name) for name in ("ground", "w_spin", "load", "speed", "reach")}
+            task = slow._replace(**known)
+            remedies.append(f"the motion slowed down to {100 / slower:.0f} %")
         if not remedies:
             break
         why = " and ".join(remedies)
         report(0.0, why)
-        solution = solve(task, solution.iterate, settings)
+        it, _, pace = (solution.iterate, task, slower) if good is None else good
+        solution = solve(task, it._replace(vs=it.vs * pace / slower), settings)
     _, reference, checks, solution = best
     return Plan(reference, checks, want, solution, tuple(attempts), scale, cycle, seconds)
 

@@ -9,7 +9,7 @@ which the augmented Lagrangian holds at that knot and its neighbours. For a foot
 """
 
 from math import inf
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -29,6 +29,12 @@ class Reach(NamedTuple):
 
     normal: Array
     most: Array
+
+    def joined(self, more: Self) -> Self:
+        """Both."""
+        if not self.most.size:
+            return more
+        return type(self)(*(np.concatenate(x, axis=1) for x in zip(self, more, strict=True)))
 
 
 NO_REACH = Reach(np.zeros((0, 0, 0)), np.zeros((0, 0)))

@@ -22,7 +22,9 @@ Report = Callable[[float, str], None]
 
 LOADED = 1.0  # N, a point is in contact during a step when its normal force exceeds this
 _PENALTY_MOST = 1e7
-_CLOSED = 1e-7  # l1 norm of the gaps in the end, m, rad, m/s, rad/s
+# l1 norm of the gaps in the end, m, rad, m/s, rad/s: the roll-out closes them without a trace in cost or constraints,
+# where Newton steps would take as many again; but a cycle's end is held more tightly than that.
+_CLOSED, _CLOSED_CYCLE = 1e-5, 1e-7
 _EARLY = 1e2  # factor on the tolerances before that
 # Gap times force (N m) and gap (m) by which the planes that a solve used may differ from the ground that is there.
 _GROUND_WORK, _GROUND = 1e-5, 1e-4
@@ -42,6 +44,8 @@ class Settings:
         end_tolerance: m, rad, m/s, rad/s, of the end of a cyclic motion.
         rounds: of the augmented Lagrangian (and of moving the ground) at the last kappa.
         most_iterations: in all, from one start.
+        patience: rounds in a row at the last kappa without progress, after which a start is given up: Newton steps ran
+            out, or violations did not halve, as where limits contradict each other.
         strict: whether loaded points may not slide at all, instead of at a cost.
         starts: most starts that are tried.
     """
@@ -58,6 +62,7 @@ class Settings:
     end_tolerance: float = 5e-7
     rounds: int = 16
     most_iterations: int = 1500
+    patience: int = 16
     strict: bool = False
     starts: int = 4
 
@@ -208,7 +213,7 @@ def _descend(
     it = start.fitting(loads=loads, speeds=speeds, beyond=beyond)
     work = Work.make(it, cyclic=task.cyclic)
     multipliers = _Multipliers(s.penalty)
-    reg, iterations, cost, failure = 1e-3, 0, np.inf, ""
+    reg, iterations, cost, failure, failed = 1e-3, 0, np.inf, "", 0
     stages = [(kappa, False) for kappa in s.kappas] + [(s.kappas[-1], True)] * s.strict
     for n, (kappa, strict) in enumerate(stages):
         last, final = n >= len(s.kappas) - 1, False
@@ -219,14 +224,14 @@ def _descend(
             most = s.iterations if last else s.early_iterations
             # What comes before the last multipliers need not be exact.
             factor, rho = 1.0 if final else _EARLY, multipliers.penalty
-            near, apart = factor * s.tolerance, factor * _CLOSED
+            near, apart = factor * s.tolerance, factor * (_CLOSED_CYCLE if task.cyclic else _CLOSED)
             status, count, cost, _, reg = ddp.solve(
                 body, task, kappa, it, rho, True, most, near, apart, max(reg, 1e-6), work
             )
             iterations += count
             if status == ddp.NOT_FINITE:
                 raise StageFailed("met numbers that are not finite", where="optimize", todo="check the key points")
-            worst = multipliers.update(body, task, it, s)
+            before, worst = multipliers.previous, multipliers.update(body, task, it, s)
             ground = np.ascontiguousarray(terrain.planes(it.qs[:, 7:].reshape(len(it.qs), -1, 3)))
             moved = differs(task, ground, it)
             new = strict and np.any(_normal_forces(task, it)[~task.stick] > LOADED)
@@ -236,7 +241,9 @@ def _descend(
             if moved:
                 failure = failure or "feet keep crossing an edge of the terrain"
                 task = task._replace(ground=ground)
-            if iterations >= s.most_iterations:
+            nothing = status != ddp.CONVERGED or worst > max(1.0, 0.5 * before)
+            failed = failed + 1 if last and nothing else 0
+            if iterations >= s.most_iterations or failed >= s.patience:
                 failure = failure or ddp.STATUS[ddp.ITERATIONS]
                 break
             if last and not failure and not new:

@@ -18,7 +18,7 @@ from slomo.robot import Robot
 from slomo.stage import Artifact, Inputs, Progress
 from slomo.terrain import Terrain
 
-VERSION = 4
+VERSION = 5
 MODELS = ("point-foot", "whole-body")
 
 
