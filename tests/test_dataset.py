@@ -90,7 +90,6 @@ def test_creatures_stand_on_the_ground_and_keep_their_bones(kind):
         assert np.allclose(bones, np.linalg.norm(c.offset[1:], axis=1), atol=1e-9)
 
 
-
 def test_heads_are_carried_high_and_low_and_turned_aside():
     skeleton = load_skeleton("quadruped")
     node = skeleton.names.index
