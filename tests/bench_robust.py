@@ -18,6 +18,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -107,7 +108,8 @@ def figure(inputs: Inputs, kind: str, truth: dict[str, Array], seed: int, out: P
     fitted = fit_stage.run_fit(inputs, config, Silent())
     inputs = replace(inputs, artifacts={**inputs.artifacts, "fit": fitted})
     result: Artifact = refine_stage.run_refine(inputs, config, Silent())
-    np.savez(out / "keypoints.npz", **result.npz["keypoints.npz"])
+    arrays: dict[str, Any] = dict(result.npz["keypoints.npz"])
+    np.savez(out / "keypoints.npz", **arrays)
     return score(load_keypoints(out / "keypoints.npz"), truth)["pa_mpjpe_percent"]
 
 
