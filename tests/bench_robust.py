@@ -39,17 +39,18 @@ BUILT_IN = Path(slomo.skeleton.__file__).parent / "skeletons"
 BONE = 0.25
 
 
-def begun(out: Path, clip: Path, *, fps: float = 30.0) -> Inputs:
-    """Decode, masks and camera of a clip."""
+def begun(out: Path, clip: Path, kind: str, *, fps: float = 30.0) -> Inputs:
+    """Decode, masks and camera of a clip, and the network that its evidence comes from, where its kind has one."""
     project = out / (clip.parent.name if fps == 30.0 else f"{clip.parent.name}-{fps:g}")
     project.mkdir(parents=True, exist_ok=True)
     session = Session(project_option=project, quiet=True)
     files = {"clip": session.user_path(clip, "clip")}
     if (u2net := SHARED / "weights" / "u2netp.onnx").is_file():
         files["weights"] = session.user_path(u2net, "weights")
-    made = session.configure({"inputs": files, "decode": {"fps": fps}})
+    made = session.configure({"inputs": files, "decode": {"fps": fps}, "reconstruct": {"skeleton": kind}})
     runner = session.runner(made)
-    return Inputs({s: made.store.load(runner.make(s)) for s in ("decode", "masks", "camera")})
+    network = {role: path for role, path in made.files("evidence").items() if role == "prior"}
+    return Inputs({s: made.store.load(runner.make(s)) for s in ("decode", "masks", "camera")}, network)
 
 
 def spoiled_masks(inputs: Inputs, rng: np.random.Generator) -> Inputs:
@@ -126,14 +127,14 @@ def main() -> None:
         with np.load(folder / "truth.npz") as z:
             truth = dict(z)
         kind = "human" if str(truth["kind"]) == "human" else "quadruped"
-        whole = begun(args.out, folder / "clip.mp4")
+        whole = begun(args.out, folder / "clip.mp4", kind)
         rng = np.random.default_rng(args.seed)
         cases: dict[str, Callable[[], Inputs]] = {
             "masks": lambda whole=whole, rng=rng: spoiled_masks(whole, rng),
             "camera": lambda whole=whole, rng=rng: spoiled_camera(whole, rng),
-            "frames": lambda folder=folder: begun(args.out, folder / "clip.mp4", fps=15.0),
+            "frames": lambda folder=folder, kind=kind: begun(args.out, folder / "clip.mp4", kind, fps=15.0),
             "bones": lambda whole=whole, rng=rng, kind=kind: replace(
-                whole, files={"skeleton": spoiled_bones(kind, args.out, rng)}
+                whole, files={**whole.files, "skeleton": spoiled_bones(kind, args.out, rng)}
             ),
         }
         base = figure(whole, kind, truth, args.seed, args.out)

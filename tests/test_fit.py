@@ -10,10 +10,11 @@ import torch
 from slomo.errors import InvalidData, UsageError
 from slomo.motion import KeypointMotion
 from slomo.pinhole import Intrinsics
-from slomo.reconstruct import hypotheses, silhouette
+from slomo.reconstruct import hypotheses, observations, silhouette
 from slomo.reconstruct.fit_stage import run_fit
 from slomo.reconstruct.hypotheses import GaitHypothesis
 from slomo.reconstruct.kinematics import Kinematics
+from slomo.reconstruct.observations import observe
 from slomo.reconstruct.refine_stage import ReconstructConfig, run_refine
 from slomo.rotation import umeyama
 from slomo.skeleton import load_skeleton
@@ -195,6 +196,26 @@ def test_masks_of_something_else_fail(walk):
     assert out.failure
     assert "silhouette_iou" in out.failure
     assert out.json["report.json"]["verdict"]["trust"] == "unusable"
+
+
+def test_a_clip_too_large_for_the_memory_is_seen_in_fewer_frames_first(walk, monkeypatch):
+    _, masks, flow = walk
+    z = {k: _inputs(masks, flow).artifacts[k].npz for k in ("masks", "camera")}
+
+    def seen():
+        t = np.arange(T) / 30  # the same frames as if there were 30 a second
+        return observe(
+            t, z["masks"]["masks.npz"], z["masks"]["flow.npz"], z["camera"]["camera.npz"], fps=30, subject_px=999
+        )
+
+    whole = seen()
+    monkeypatch.setattr(observations, "MOST_PIXELS", T * 90 * 160 / 2)
+    half = seen()
+    monkeypatch.setattr(observations, "MOST_PIXELS", T * 90 * 160 / 8)
+    small = seen()
+    assert (len(whole.at), len(half.at), len(small.at)) == (T, T // 2, T // 2)
+    assert (whole.scale, half.scale) == (1.0, 1.0)
+    assert small.scale == pytest.approx(0.5, abs=0.02)
 
 
 def test_parts_that_disagree_are_refused(walk):

@@ -20,7 +20,7 @@ Array = np.ndarray
 Tensor = torch.Tensor
 
 STATIC_PX = 0.35  # a pixel moves with the ground when its flow differs by about this many working pixels
-LONG_FPS = 15.0
+LONG_FPS = 15.0  # of a clip with more pixels than those: rather fewer frames than small ones
 MOST_PIXELS = 30e6  # working pixels of all fit frames together, each of which takes about 40 bytes
 
 
