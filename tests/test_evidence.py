@@ -263,6 +263,16 @@ def test_the_nearest_place_of_the_body_undoes_the_canonical_coordinate():
     np.testing.assert_allclose(KNOWN.canonical(*found), X, atol=2e-3)
 
 
+def test_the_surface_is_that_of_the_body_the_network_learnt_whatever_the_bones_of_this_one(scene: Scene):
+    longer = dataclasses.replace(SKELETON, offset=1.25 * SKELETON.offset)
+    said = gather(scene.arrays, scene.obs, longer)
+    torch.testing.assert_close(said.capsule, scene.said.capsule)
+    torch.testing.assert_close(said.along, scene.said.along)
+    torch.testing.assert_close(said.normal, scene.said.normal)
+    fewer = dataclasses.replace(longer, capsule_names=("another", *SKELETON.capsule_names[1:]))
+    assert not torch.equal(gather(scene.arrays, scene.obs, fewer).along, scene.said.along)
+
+
 def test_doubted_sides_cost_no_more_than_their_odds_and_prefer_the_right_way(scene: Scene):
     N = len(SKELETON.names)
     doubted = gather({**scene.arrays, "keypoint_side": np.full(N, 0.75)}, scene.obs, SKELETON)

@@ -11,6 +11,7 @@ from slomo.reconstruct.flow import dense_flow
 from slomo.reconstruct.motion_segment import border_distance
 from slomo.reconstruct.segment import blend_over_time, component_at, frame_certainty, frame_quality, spans
 from slomo.reconstruct.stage import DecodeConfig, MasksConfig, pack, run_decode, run_masks, unpack
+from slomo.reconstruct.surroundings import give_back_patches
 from slomo.reconstruct.votes import vote_over_time
 from slomo.stage import Artifact, Inputs, Silent
 
@@ -97,6 +98,39 @@ def test_votes_find_what_single_frames_miss_and_stop_at_another_colour():
         frames[t][piece[t]] = 255 - frames[t][piece[t]]
     other = np.stack([*vote_over_time(layers, frames, flow, lambda f: None)])
     assert other[8][piece[8]].mean() < 0.5 * votes[8][piece[8]].mean()
+
+
+def furniture(T: int = 40) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """A pale body before a brown floor and a white wall, with a brown head and beside a brown box before the wall."""
+    y, x = np.mgrid[:120, :200]
+    parts = dict(
+        body=((x - 100) / 40) ** 2 + ((y - 62) / 22) ** 2 < 1,
+        head=(x - 68) ** 2 + (y - 36) ** 2 < 90,
+        box=(np.abs(x - 132) < 10) & (np.abs(y - 34) < 12),
+        floor=(np.abs(x - 95) < 18) & (y > 78) & (y < 96),
+    )
+    picture = np.where((y > 58)[..., None], np.array([95.0, 55, 35]), np.array([225.0, 225, 230]))
+    picture[parts["head"] | parts["box"]] = 95, 55, 35
+    picture[parts["body"]] = 215, 185, 140
+    rng = np.random.default_rng(0)
+    return np.uint8(np.clip(picture + rng.normal(0, 3, (T, *picture.shape)), 0, 255)), parts
+
+
+def test_pieces_of_furniture_are_given_back_and_a_head_of_their_colour_is_not():
+    frames, parts = furniture()
+    flow = dense_flow(frames)
+    layers = {k: (parts["body"] | parts["head"]).astype(np.float16) for k in range(len(frames))}
+    for k in range(12, 40):  # has no edge where the mask ends
+        layers[k][parts["floor"]] = 1
+    for k in range(20, 26):  # has edges all round, but only these frames take it for the body
+        layers[k][parts["box"]] = 1
+    assert give_back_patches(frames, layers, flow) == 28
+    for k in (0, 15, 23, 39):
+        seen = layers[k] > 0.5
+        assert seen[parts["body"]].mean() > 0.97
+        assert seen[parts["head"]].mean() > 0.95
+        assert seen[parts["box"] & ~parts["body"]].mean() < 0.1
+        assert seen[parts["floor"] & ~parts["body"]].mean() < 0.15
 
 
 def test_component_and_reach():

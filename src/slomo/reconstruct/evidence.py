@@ -11,7 +11,7 @@ import torch
 
 from slomo.prior.labels import BINS, Labels, labels
 from slomo.reconstruct.observations import Observations
-from slomo.skeleton import Skeleton
+from slomo.skeleton import Skeleton, list_skeletons, load_skeleton
 
 Array = np.ndarray
 Tensor = torch.Tensor
@@ -131,7 +131,7 @@ def gather(arrays: Mapping[str, Array], obs: Observations, skeleton: Skeleton) -
     surface, has_surface = rows("surface", like=(3, 1, 1))
     blur, _ = rows("surface_scale", like=surface.shape[2:])
     doubted = side * parts + (1 - side) * parts[:, known.mirror_part] if has_parts.any() else parts
-    points = _surface(surface, blur, has_surface, parts if has_parts.any() else None, box, obs, known)
+    points = _surface(surface, blur, has_surface, parts if has_parts.any() else None, box, obs, learnt(skeleton))
     # The place on the other limb is as likely as the sides are doubtful: what is left is the difference of the two.
     sided = known.mirror_part[known.capsule_part] != known.capsule_part
     points["sure"] = points["sure"] * f(np.where(sided, 2 * side - 1, 1.0))[points["capsule"]]
@@ -145,6 +145,13 @@ def gather(arrays: Mapping[str, Array], obs: Observations, skeleton: Skeleton) -
         **_likeliest(doubted), parts_weight=f(has_parts) * obs.quality, part_capsules=_capsules(known),
         **points,
     )  # fmt: skip
+
+
+def learnt(skeleton: Skeleton) -> Labels:
+    """The labels whose canonical surface a network speaks of: those of the built-in skeleton of that kind, which it was
+    trained with, as long as the given one has the same capsules, of whatever lengths; else the given one's own."""
+    own = load_skeleton(skeleton.kind) if skeleton.kind in list_skeletons() else skeleton
+    return labels(own if own.capsule_names == skeleton.capsule_names else skeleton)
 
 
 def _filled(path: Array, known: Array) -> Array:

@@ -16,7 +16,7 @@ from slomo.reconstruct.segment import (
     grown,
     no_subject,
 )
-from slomo.reconstruct.surroundings import give_back_surroundings
+from slomo.reconstruct.surroundings import give_back_patches, give_back_surroundings
 from slomo.reconstruct.u2net import U2Net
 from slomo.reconstruct.votes import vote_over_time
 
@@ -62,6 +62,7 @@ class SaliencySegmenter:
         layers = track.layers
         told = track.settle_who_is_who()
         repaired = give_back_surroundings(frames, layers)
+        patched = give_back_patches(frames, layers, flow)
         progress(0.8)
         probability = vote_over_time(layers, frames, flow, lambda f: progress(0.8 + 0.15 * f))
         masks, certainty = np.empty(frames.shape[:3], bool), np.zeros(T)
@@ -77,7 +78,7 @@ class SaliencySegmenter:
             raise no_subject("what stands out in the picture never moves against the background")
         report |= {"weights_sha256": self.network.digest, "network_frames": len(keys), "seed_frame": seed}
         report |= {"frames_with_others": told, "frames_lost": sum(not p.any() for p in layers.values())}
-        return Masks(masks, certainty, report | {"colour_repaired_frames": repaired})
+        return Masks(masks, certainty, report | {"colour_repaired_frames": repaired, "patched_frames": patched})
 
     def _start(self, keys: list[int], frames: np.ndarray, motion: SharedMotion, progress: Report):
         """The frame to start from, the subject and the others in it (H, W) bool, and what the report says of that.

@@ -3,10 +3,16 @@
 import cv2
 import numpy as np
 
-from slomo.reconstruct.colour import cut, learn_colours, to_lab
+from slomo.reconstruct.colour import ColourModel, cut, learn_colours, to_lab
+from slomo.reconstruct.flow import Flow, inside, sample
 from slomo.reconstruct.segment import grown
 
 _FOREIGN = 0.17  # part of a mask in patches of the surroundings' colours, from which on it is cut anew
+_COLOUR = -0.75  # mean log ratio of a patch that is of the surroundings
+_LEAST = 0.02  # of the mask, a patch that is worth looking at
+_FAINT = 0.6  # outline of a patch against its own edge to the body: furniture goes on beyond the mask
+_APART = (10, 20, 30, 45)  # frames before and after in which a patch is looked for
+_RARELY = 0.5  # of those frames: a patch that is seen less often does not belong to the body
 
 
 def give_back_surroundings(frames: np.ndarray, layers: dict[int, np.ndarray]) -> int:
@@ -38,6 +44,81 @@ def give_back_surroundings(frames: np.ndarray, layers: dict[int, np.ndarray]) ->
             if left[k] < 0.5 * trusted_area and len(layers) > len(left) // 3:
                 del layers[k]
     return len(swallowing)
+
+
+def give_back_patches(frames: np.ndarray, layers: dict[int, np.ndarray], flow: Flow) -> int:
+    """Take out of `layers`, in place, pieces of furniture that are less than half of what the function above looks for.
+
+    A piece that a cut by colour (learned over the whole clip) would take away goes if it is of the colours of the
+    surroundings and one of two things shows that it is theirs: the mask ends in the middle of it, with no edge there
+    that is like the one between it and the body; or most frames around do not take the same place, followed along the
+    flow, for the body. A head of the background's colour has an edge all round and is always there. Twice over, because
+    colours are known better once some is gone. Returns the frames concerned.
+    """
+    bodies = {k: p > 0.5 for k, p in layers.items()}
+    changed: set[int] = set()
+    for _ in range(2):
+        there = {k: b for k, b in bodies.items() if b.any()}
+        if len(there) < 2:
+            break
+        model = learn_colours(frames, there, reach=2.0)
+        taken = {k: _patches(frames[k], k, bodies, model, flow) for k in there}
+        for k, gone in taken.items():
+            if gone.any():
+                changed.add(k)
+                bodies[k] &= ~gone
+                layers[k] = np.where(grown(gone, 0.1) & ~bodies[k], 0, layers[k]).astype(np.float16)
+    return len(changed)
+
+
+def _patches(frame: np.ndarray, k: int, bodies: dict[int, np.ndarray], model: ColourModel, flow: Flow) -> np.ndarray:
+    """(H, W) bool: the pieces of body k that are of the surroundings."""
+    body, lab = bodies[k], to_lab(frame)
+    area, gone = float(body.sum()), np.zeros_like(body)
+    colour = cv2.GaussianBlur(model(lab), (0, 0), 1.5)
+    radius = max(1, round(0.03 * np.sqrt(area)))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    opened = lambda m: cv2.morphologyEx(m.astype(np.uint8), cv2.MORPH_OPEN, disc)  # noqa: E731
+    if opened(body & (colour < -0.5)).sum() < _LEAST * area:
+        return gone
+    probability = 1 / (1 + np.exp(-1.5 * np.clip(colour, -2, 2) - np.where(body, 1.0, -1.0)))
+    probability = np.where(body, probability, np.where(grown(body, 0.05), np.minimum(probability, 0.5), 0.0))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(opened(body & ~cut(frame, probability)), connectivity=8)
+    edge = _edges(lab)
+    for i in range(1, count):
+        piece = labels == i
+        if stats[i, cv2.CC_STAT_AREA] < _LEAST * area or colour[piece].mean() > _COLOUR:
+            continue
+        beside = cv2.dilate(piece.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        end, seam = _along(edge, body, piece), _along(edge, body & ~piece, beside)
+        if end < _FAINT * seam or _lasting(piece, k, bodies, flow) < _RARELY:
+            gone |= piece
+    return gone
+
+
+def _edges(lab: np.ndarray) -> np.ndarray:
+    """(H, W) the strongest change of colour next to each pixel."""
+    smooth = cv2.GaussianBlur(lab.astype(np.float32), (0, 0), 1.0)
+    change = sum((cv2.Sobel(smooth, cv2.CV_32F, *d, ksize=3) ** 2).sum(-1) for d in ((1, 0), (0, 1)))
+    return cv2.dilate(np.sqrt(change), np.ones((3, 3), np.uint8))
+
+
+def _along(edge: np.ndarray, body: np.ndarray, where: np.ndarray) -> float:
+    """Mean edge along the outline of a body where that is; infinite where there is none."""
+    outline = body & (cv2.erode(body.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0) & where
+    return float(edge[outline].mean()) if outline.any() else np.inf
+
+
+def _lasting(piece: np.ndarray, k: int, bodies: dict[int, np.ndarray], flow: Flow) -> float:
+    """Part of a piece of frame k that the frames around it take for the body, too; 1 where it is not seen elsewhere."""
+    parts = []
+    for other in (k + d for gap in _APART for d in (gap, -gap)):
+        if other in bodies and bodies[other].any():
+            offset = flow.chain(k, other)
+            seen = piece & inside(offset)
+            if seen.sum() > 0.5 * piece.sum():
+                parts.append(float(sample(bodies[other].astype(np.float32), offset)[seen].mean()))
+    return float(np.mean(parts)) if parts else 1.0
 
 
 def _foreign(body: np.ndarray, colour: np.ndarray) -> float:
