@@ -99,6 +99,19 @@ def test_one_crosses_behind_the_other_and_each_can_be_picked():
     assert picked.report["chosen"] == "at"
 
 
+def test_a_small_animal_among_large_things_before_a_camera_that_stands_still():
+    def large(x, y):
+        return (abs(x) < 28) & (y > 8) & (y < 70)
+
+    def tiny(x, y):
+        return (x / 20) ** 2 + ((y - 95) / 11) ** 2 < 1
+
+    things = [(large, lambda t: 40.0, GREY), (large, lambda t: 150.0, GREEN), (tiny, lambda t: 40 + 2.0 * t, RED)]
+    frames, (_, _, animal) = scene(30, things)
+    found = segment(frames)
+    assert iou(found.masks, animal).mean() > 0.85
+
+
 def test_a_box_picks_and_an_empty_place_says_so():
     things = [(small_body, lambda t: 170 + 0.5 * t, GREEN), (body, lambda t: 50 + 1.0 * t, RED)]
     frames, (right, left) = scene(16, things)

@@ -5,16 +5,18 @@ import cv2
 import numpy as np
 
 from slomo.reconstruct.flow import Flow, sample
+from slomo.reconstruct.instances import components
 from slomo.reconstruct.motion_segment import residual_motion
 
 _SIDE = 256  # px, longer side at which motion is looked at
 _GAP = 4  # frames over which it is taken, either way
-_MOVES = 2.0  # px at that size and over that gap, from which on a body as a whole is said to move
+MOVES = 2.0  # px at that size and over that gap, from which on a body as a whole is said to move
 _FOREIGN = 0.2  # part of the body's motion, below which a patch does not share it
 _LOST = 64.0  # px, a motion that flow cannot have followed
 _ASTRAY = 1.5  # px, median motion of the whole picture, from which on the homography has not been found
 _BENDS = 1.5  # px of motion that no flat thing has, from which on a body is said to be alive
 _KEPT = 64  # frames whose motion is remembered
+_STILL = 0.3  # px of the median motion, below which the camera stands still and nothing has parallax
 
 
 class SharedMotion:
@@ -25,6 +27,7 @@ class SharedMotion:
         self._factor = _SIDE / max(flow.size)
         self._size = (round(flow.size[0] * self._factor), round(flow.size[1] * self._factor))
         self._known: dict[int, np.ndarray] = {}
+        self._drift: dict[int, float] = {}  # px, median motion of the whole picture
 
     def residual(self, t: int) -> np.ndarray:
         """(h, w, 2) float32 px at `_SIDE` over `_GAP` frames; NaN where something covers or uncovers the pixel, so that
@@ -32,9 +35,10 @@ class SharedMotion:
         if t not in self._known:
             last = len(self._flow.forward)
             ends = [u for u in (t - _GAP, t + _GAP) if 0 <= u <= last] or [last if t < last / 2 else 0]
-            fields, errors = [], []
+            fields, errors, drift = [], [], []
             for u in ends:
                 there, back = self._chain(t, u), self._chain(u, t)
+                drift.append(float(np.median(np.linalg.norm(there, axis=-1))) * _GAP / abs(u - t))
                 fields.append(residual_motion(there) * (_GAP / (u - t)))
                 errors.append(np.linalg.norm(there + sample(back, there), axis=-1, keepdims=True))
             best = fields[0] if len(ends) == 1 else np.where(errors[0] < errors[1], *fields)
@@ -45,6 +49,7 @@ class SharedMotion:
             while len(self._known) >= _KEPT:
                 self._known.pop(next(iter(self._known)))
             self._known[t] = np.where(unsure, np.nan, best).astype(np.float16)
+            self._drift[t] = max(drift)
         return self._known[t].astype(np.float32)
 
     def velocity(self, t: int, mask: np.ndarray) -> np.ndarray:
@@ -54,7 +59,8 @@ class SharedMotion:
 
     def liveliness(self, t: int, mask: np.ndarray) -> float:
         """How surely (H, W) bool is alive in frame t; from 1 on it is: it moves fast as a whole, or its liveliest tenth
-        moves in a way that no flat thing does (what an affine motion leaves), as parallax cannot make a box do."""
+        moves in a way that no flat thing does (what an affine motion leaves), as parallax cannot make a box do. Fast is
+        a quarter of that before a camera that stands still."""
         small = cv2.resize(mask.astype(np.float32), self._size, interpolation=cv2.INTER_AREA) > 0.9
         y, x = np.nonzero(small & np.isfinite(self.residual(t)[..., 0]))
         if len(x) < 20:
@@ -64,7 +70,17 @@ class SharedMotion:
         rest = np.linalg.norm(motion - design @ np.linalg.lstsq(design, motion, rcond=None)[0], axis=-1)
         calm = rest <= np.quantile(rest, 0.7)  # limbs must not bend the motion of the whole
         rest = np.linalg.norm(motion - design @ np.linalg.lstsq(design[calm], motion[calm], rcond=None)[0], axis=-1)
-        return float(max(np.quantile(rest, 0.9) / _BENDS, np.linalg.norm(np.median(motion, axis=0)) / (2 * _MOVES)))
+        fast = (0.5 if self._drift[t] < _STILL else 2.0) * MOVES
+        return float(max(np.quantile(rest, 0.9) / _BENDS, np.linalg.norm(np.median(motion, axis=0)) / fast))
+
+    def movers(self, t: int) -> list[np.ndarray]:
+        """Where (H, W) bool something moves in frame t, at most three places, by how much moves there."""
+        size = np.nan_to_num(np.linalg.norm(self.residual(t), axis=-1)).astype(np.float32)
+        fast = cv2.morphologyEx((size > 0.5 * MOVES).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+        pieces = components(fast > 0, 20)
+        pieces.sort(key=lambda piece: -float(size[piece].sum()))
+        whole = lambda m: cv2.resize(m.astype(np.uint8), self._flow.size, interpolation=cv2.INTER_NEAREST) > 0  # noqa: E731
+        return [whole(piece) for piece in pieces[:3]]
 
     def _inside(self, t: int, mask: np.ndarray) -> np.ndarray:
         """(n, 2) what of the residual is known and lies in (H, W) bool."""
@@ -76,7 +92,7 @@ class SharedMotion:
         """(H, W): how much of the `velocity` (2,) of a body each pixel has along the same direction: 1 of a part of it,
         0 of the background, less of what goes the other way, NaN where that cannot be seen. None of a body at rest."""
         speed = float(np.linalg.norm(velocity))
-        if speed < _MOVES:
+        if speed < MOVES:
             return None
         return cv2.resize(self.residual(t) @ (velocity / speed**2), self._flow.size, interpolation=cv2.INTER_NEAREST)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from slomo.reconstruct.flow import Flow, sample
 from slomo.reconstruct.instances import Choice, Look, components, distance, tell_apart
-from slomo.reconstruct.instances_motion import SharedMotion, foreign
+from slomo.reconstruct.instances_motion import MOVES, SharedMotion, foreign
 from slomo.reconstruct.segment import (
     Masks,
     Report,
@@ -102,6 +102,11 @@ class SaliencySegmenter:
                 body = component_at(p > 0.5)
                 bodies[t] = component_at(body & ~foreign(body, body, motion.share(t, motion.velocity(t, body))))
             speed = {t: min(float(np.linalg.norm(motion.velocity(t, b))), _FAST) for t, b in bodies.items()}
+            if max(speed.values()) < MOVES:  # what stands out is furniture, or rests
+                for t in probes:
+                    p, body = self._mover(frames[t], motion.movers(t))
+                    if (v := float(np.linalg.norm(motion.velocity(t, body)))) > max(MOVES, speed[t]):
+                        whole[t], bodies[t], speed[t] = p, body, min(v, _FAST)
             # What stands out in one frame may be a box; what moves as well is the better start.
             clarity = {
                 t: _clarity(p, bodies[t]) * (0.1 + speed[t] / (max(speed.values()) + 1)) for t, p in whole.items()
@@ -113,6 +118,17 @@ class SaliencySegmenter:
         others = (whole[seed] > 0.5) & ~grown(subject, 0.03)
         report = {"chosen": self.choice.how, "instances": int(np.median(counts)), "instances_most": max(counts)}
         return seed, (subject, others), report
+
+    def _mover(self, frame: np.ndarray, movers: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Of the places (H, W) bool where something moves, what the network finds in the first in which it finds
+        anything: its answer and the body. In the whole frame what is large and still outshines a small animal."""
+        nothing = np.zeros(frame.shape[:2], np.float32)
+        for moving in movers:
+            seen = self.network.crop(frame, box_of(moving, margin=0.5))
+            body = component_at(seen > 0.5, moving)
+            if (body & moving).sum() > 0.3 * moving.sum() and body.sum() < 6 * moving.sum():
+                return seen, body
+        return nothing, nothing > 0
 
     def _pointed_at(self, frame: np.ndarray, whole: np.ndarray) -> np.ndarray:
         """(H, W) bool of what the user's point or box means in `frame`, of which the network has seen the `whole`."""

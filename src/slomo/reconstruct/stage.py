@@ -13,7 +13,7 @@ from slomo.reconstruct.video import decode
 from slomo.stage import Artifact, Inputs, Progress
 
 DECODE_VERSION = 2
-MASKS_VERSION = 5
+MASKS_VERSION = 6
 CAMERA_VERSION = 4
 
 SEGMENTERS = ("auto", "u2netp", "motion", "user")
