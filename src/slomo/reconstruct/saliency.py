@@ -104,7 +104,9 @@ class SaliencySegmenter:
             speed = {t: min(float(np.linalg.norm(motion.velocity(t, b))), _FAST) for t, b in bodies.items()}
             if max(speed.values()) < MOVES:  # what stands out is furniture, or rests
                 for t in probes:
-                    p, body = self._mover(frames[t], motion.movers(t))
+                    # A paw that one lifts that stands is no animal of its own.
+                    movers = [m for m in motion.movers(t) if (m & bodies[t]).sum() < 0.5 * m.sum()]
+                    p, body = self._mover(frames[t], movers)
                     if (v := float(np.linalg.norm(motion.velocity(t, body)))) > max(MOVES, speed[t]):
                         whole[t], bodies[t], speed[t] = p, body, min(v, _FAST)
             # What stands out in one frame may be a box; what moves as well is the better start.
