@@ -263,6 +263,26 @@ def test_the_nearest_place_of_the_body_undoes_the_canonical_coordinate():
     np.testing.assert_allclose(KNOWN.canonical(*found), X, atol=2e-3)
 
 
+def test_a_tail_that_the_masks_miss_costs_little_and_a_leg_much(scene: Scene):
+    path, kin = scene.path, KIN
+    s = Problem(scene.obs, kin, path, {}, 0.01).state(
+        scene.x, scene.true, Draw(torch.arange(T), torch.arange(W * H).expand(T, -1), 0), stance_weight=0.0
+    )
+    owner, mask = s.sd[0].argmin(-1).reshape(T, H, W).numpy(), scene.obs.mask.reshape(T, H, W).numpy()
+
+    def cost(*parts: str) -> dict[str, float]:
+        missing = np.isin(owner, [i for i, n in enumerate(SKELETON.capsule_names) if n in parts])
+        obs = _observations(mask & ~missing)
+        problem = Problem(obs, kin, path, {"mask": 1.0, "reach": 1.0}, 0.01)
+        draw = problem.draw(T, 2000, torch.Generator().manual_seed(1))
+        _, terms = problem.loss(scene.x, scene.true, draw)
+        return {k: float(v[0]) for k, v in terms.items()}
+
+    whole, tail, leg = cost(), cost("tail_1", "tail_2"), cost("hind_left_shank", "hind_left_foot")
+    assert tail["mask"] - whole["mask"] < 0.5 * (leg["mask"] - whole["mask"])
+    assert tail["reach"] - whole["reach"] < 0.3 * (leg["reach"] - whole["reach"])
+
+
 def test_the_surface_is_that_of_the_body_the_network_learnt_whatever_the_bones_of_this_one(scene: Scene):
     longer = dataclasses.replace(SKELETON, offset=1.25 * SKELETON.offset)
     said = gather(scene.arrays, scene.obs, longer)

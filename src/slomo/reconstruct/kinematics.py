@@ -75,6 +75,7 @@ class Kinematics:
         self.lower, self.upper, self.sigma = f(skeleton.lower), f(skeleton.upper), f(skeleton.sigma)
         self.c_link, self.c_nodes = i(skeleton.capsule_link), i(skeleton.capsule_nodes)
         self.c_shift, self.c_radii = f(skeleton.capsule_shift), f(skeleton.capsule_radii)
+        self.c_tail = torch.tensor(["tail" in n for n in skeleton.capsule_names])
         self.c_own = self.c_nodes == self.c_link[:, None]
         # Left and right share the variable of the first of the two; y is mirrored for the other.
         first = torch.minimum(self.mirror, torch.arange(len(self.mirror)))

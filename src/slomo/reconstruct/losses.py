@@ -19,6 +19,9 @@ Tensor = torch.Tensor
 SOFT_PX = 0.7  # width of the silhouette's edge and of the smooth minimum over capsules, working pixels
 SWING = 3.0  # accelerations of a gait's nodes in units of speed squared over body length
 SLIDE = 0.75  # body lengths / s of a standing foot: the unit of its drift
+# Masks lose tails in some frames and find them in others. A tail that was pushed out of all the background where it is
+# missed would hide behind the body for good; these are what it costs there, against any other part.
+TAIL_COVERS, TAIL_OUTSIDE = 0.3, 0.1
 FLOW_PX = 0.25  # flow errors below this are noise, working pixels
 
 
@@ -75,7 +78,8 @@ def mask(s: State) -> Tensor:
     n = s.inside
     one = torch.ones_like(s.u)
     miss = _frame_mean(s, empty[:, :, :n], one[:, :n])
-    extra = _frame_mean(s, 1 - empty[:, :, n:], one[:, n:])
+    owed = torch.where(s.kin.c_tail, TAIL_COVERS, 1.0)[s.sd[:, :, n:].argmin(-1)]
+    extra = _frame_mean(s, owed * (1 - empty[:, :, n:]), one[:, n:])
     return miss + extra
 
 
@@ -97,6 +101,7 @@ def reach(s: State) -> Tensor:
     away = away.reshape(S, H, N).permute(1, 0, 2)
     # A bone's axis lies its radius inside; outside the picture nothing is known.
     shown = ((x.abs() < 1) & (y.abs() < 1)).float() * s.obs.quality[s.seen][:, None]
+    shown = shown * torch.where(s.kin.c_tail, TAIL_OUTSIDE, 1.0).repeat(3)
     over = (away + 0.6 * r).clamp(min=0) / 5.0
     outside = ((torch.sqrt(over**2 + 0.01) - 0.1) * shown).sum((1, 2)) / (shown.sum((1, 2)) + 1e-6)
     return unexplained + outside
