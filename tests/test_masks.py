@@ -198,6 +198,20 @@ def test_motion_segmenter(camera):
     assert out.npz["flow.npz"]["flow"].dtype == np.float16
 
 
+def test_still_segmenter_finds_what_a_network_would_miss():
+    frames, masks = moving_disc(40, speed=3.0, camera=0.0)
+    rng = np.random.default_rng(0)
+    frames = np.uint8(np.clip(frames + rng.normal(0, 3, frames.shape), 0, 255))
+    found = run_masks(inputs(frames), MasksConfig(), Silent())
+    assert found.json["report.json"]["segmenter"] == "still"
+    assert iou(unpack(found.npz["masks.npz"]), masks).min() > 0.85
+    with pytest.raises(InvalidData, match="this one moves"):
+        run_masks(inputs(moving_disc()[0]), MasksConfig(segmenter="still"), Silent())
+    rests = np.uint8(np.clip(frames[:1] + rng.normal(0, 3, frames.shape), 0, 255))
+    with pytest.raises(InvalidData, match="nothing"):
+        run_masks(inputs(rests), MasksConfig(segmenter="still"), Silent())
+
+
 def test_clip_without_a_subject():
     frames = np.repeat(np.uint8(noise(120, 200, 3))[None], 10, 0)
     with pytest.raises(InvalidData, match="no subject found") as caught:
@@ -230,7 +244,7 @@ def test_user_masks_that_do_not_fit(tmp_path):
 
 def test_choice_of_segmenter(tmp_path):
     frames, _ = moving_disc(10)
-    with pytest.raises(UsageError, match=r"auto, u2netp, motion, user"):
+    with pytest.raises(UsageError, match=r"auto, u2netp, still, motion, user"):
         run_masks(inputs(frames), MasksConfig(segmenter="sam"), Silent())
     with pytest.raises(UsageError, match="SLOMO_U2NETP"):
         run_masks(inputs(frames), MasksConfig(segmenter="u2netp"), Silent())

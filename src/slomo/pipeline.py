@@ -269,7 +269,7 @@ class Project:
         """Leave only what the segmenter reads, so that nothing else is in the key."""
         if segmenter not in ("auto", "user"):
             found.pop("masks", None)
-        if segmenter in ("motion", "user") or "masks" in found:
+        if segmenter in ("still", "motion", "user") or "masks" in found:
             found.pop("weights", None)
         elif "weights" not in found and (weights := _find_weights()):
             found["weights"] = weights

@@ -13,7 +13,7 @@ SkeletonOption = Annotated[
     str | None, typer.Option("--skeleton", metavar="quadruped|human|PATH", help="Whose bones to fit.")
 ]
 SegmenterOption = Annotated[
-    str | None, typer.Option("--segmenter", metavar="auto|u2netp|motion|user", help="How the subject is found.")
+    str | None, typer.Option("--segmenter", metavar="auto|u2netp|still|motion|user", help="How the subject is found.")
 ]
 MasksOption = Annotated[Path | None, typer.Option("--masks", metavar="DIR", help="Your own masks, one image a frame.")]
 WeightsOption = Annotated[Path | None, typer.Option("--weights", help="U2-Net-p weights (.onnx).")]

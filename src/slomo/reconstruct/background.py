@@ -64,11 +64,16 @@ class Overlay:
         now = self.rgb[t].astype(np.float32)
         median = np.where(np.isfinite(median), median, now)
         spread = (np.abs(x - median).mean(-1) * ok).sum(0) / np.maximum(count, 1)
-        size = np.linalg.norm(now - median, axis=-1)
-        shade = (now * median).sum(-1) / np.maximum((median**2).sum(-1), 1.0)
-        in_shade = np.linalg.norm(now - shade[..., None] * median, axis=-1)
-        size = np.where((shade > _SHADOW[0]) & (shade < _SHADOW[1]), in_shade, size)
-        ratio = size / (_NOISE + 1.5 * spread)
-        trust = np.clip(2.0 - spread / _NOISE, 0.0, 1.0)  # of "like the background": nothing where layers disagree
-        log_odds = np.where(ratio > 2.0, 1.5 * (ratio - 2.0), trust * (ratio - 2.0))
-        return np.where(count >= 2, np.clip(log_odds, -2.0, 4.0), 0.0).astype(np.float32)
+        return np.where(count >= 2, log_odds(now, median, spread), 0.0).astype(np.float32)
+
+
+def log_odds(now: np.ndarray, median: np.ndarray, spread: np.ndarray, noise: float = _NOISE) -> np.ndarray:
+    """(h, w) about -2 to 4, that a pixel is no background. Args: RGB now and in the background's `median` (h, w, 3);
+    `spread` (h, w), levels by which samples of the background differ; `noise`, levels that always are."""
+    size = np.linalg.norm(now - median, axis=-1)
+    shade = (now * median).sum(-1) / np.maximum((median**2).sum(-1), 1.0)
+    in_shade = np.linalg.norm(now - shade[..., None] * median, axis=-1)
+    size = np.where((shade > _SHADOW[0]) & (shade < _SHADOW[1]), in_shade, size)
+    ratio = size / (noise + 1.5 * spread)
+    trust = np.clip(2.0 - spread / noise, 0.0, 1.0)  # of "like the background": nothing where samples disagree
+    return np.clip(np.where(ratio > 2.0, 1.5 * (ratio - 2.0), trust * (ratio - 2.0)), -2.0, 4.0)

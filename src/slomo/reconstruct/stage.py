@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slomo.errors import UsageError
+from slomo.errors import InvalidData, UsageError
 from slomo.reconstruct.video import decode
 from slomo.stage import Artifact, Inputs, Progress
 
@@ -16,7 +16,9 @@ DECODE_VERSION = 2
 MASKS_VERSION = 6
 CAMERA_VERSION = 4
 
-SEGMENTERS = ("auto", "u2netp", "motion", "user")
+SEGMENTERS = ("auto", "u2netp", "still", "motion", "user")
+_LOST = 0.05  # part of the frames without the subject, from which on the other masks are taken
+_SURE = 0.8  # mean quality over all frames, below which they are
 
 
 @dataclass(frozen=True)
@@ -44,8 +46,9 @@ class MasksConfig:
     """How the subject is found.
 
     Attributes:
-        segmenter: "auto" (the user's masks when given, else u2netp when its weights are at hand, else motion),
-            "u2netp", "motion" or "user".
+        segmenter: "auto" (the user's masks when given, else u2netp when its weights are at hand, else motion; before a
+            camera that stands still "still" where those find nothing or too little), "u2netp", "still", "motion" or
+            "user".
         network_every: the network runs on every n-th frame; flow fills the frames between.
         subject_at: (u, v) or (u, v, s), a pixel of the upright clip on the subject, and when; without a time, in the
             first frame used. Empty: the largest.
@@ -129,9 +132,9 @@ def run_masks(inputs: Inputs, config: MasksConfig, progress: Progress) -> Artifa
     frames = decoded.npz["frames.npz"]["frames"]
     choice = choose(config.subject_at, config.subject_box, decoded.json.get("video.json", {}), len(frames))
     segmenter = _segmenter(inputs, config, choice)
-    progress.note(f"masks: segmenter {segmenter.name}")
     flow = dense_flow(frames, lambda f: progress.update(0.25 * f, "optical flow"))
-    found = segmenter.segment(frames, flow, lambda f: progress.update(0.25 + 0.7 * f, f"masks ({segmenter.name})"))
+    segmenter, found = _segmented(segmenter, config, choice, frames, flow, progress)
+    progress.note(f"masks: segmenter {segmenter.name}")
     quality = frame_quality(found.masks, flow, found.certainty)
     seen = np.asarray(found.masks.any((1, 2)))
     report = {
@@ -209,6 +212,34 @@ def unpack(arrays) -> np.ndarray:
     return np.unpackbits(arrays["packed"], axis=-1)[..., : int(arrays["shape"][2])].astype(bool)
 
 
+def _segmented(segmenter, config: MasksConfig, choice, frames: np.ndarray, flow, progress: Progress):
+    """The segmenter whose masks are taken, and its masks.
+
+    Before a camera that stands still, "auto" looks at what differs from the picture without the subject as well, and
+    takes that where the other finds nobody, loses the subject or is not sure of it: networks miss what is small.
+    """
+    from slomo.reconstruct.segment import frame_quality
+    from slomo.reconstruct.still_segment import StillSegmenter, stands_still
+
+    report = lambda f: progress.update(0.25 + 0.7 * f, f"masks ({segmenter.name})")  # noqa: E731
+    if config.segmenter != "auto" or segmenter.name == "user" or not stands_still(flow):
+        return segmenter, segmenter.segment(frames, flow, report)
+    still = StillSegmenter(choice)
+    try:
+        other = still.segment(frames, flow, lambda f: progress.update(0.25 + 0.1 * f, "masks (still)"))
+    except InvalidData:
+        return segmenter, segmenter.segment(frames, flow, report)
+    if segmenter.name == "motion":
+        return still, other
+    try:
+        found = segmenter.segment(frames, flow, report)
+    except InvalidData:
+        return still, other
+    lost = other.masks.any((1, 2)) & ~found.masks.any((1, 2))
+    sure = frame_quality(found.masks, flow, found.certainty).mean()
+    return (still, other) if lost.mean() > _LOST or sure < _SURE else (segmenter, found)
+
+
 def _segmenter(inputs: Inputs, config: MasksConfig, choice):
     """The segmenter that the configuration and the files at hand decide on."""
     name = config.segmenter
@@ -235,6 +266,10 @@ def _segmenter(inputs: Inputs, config: MasksConfig, choice):
                 todo=f"set {WEIGHTS_VARIABLE} to their path, or use --segmenter motion",
             )
         return SaliencySegmenter(U2Net(inputs.files["weights"]), choice, every=max(1, config.network_every))
+    if name == "still":
+        from slomo.reconstruct.still_segment import StillSegmenter
+
+        return StillSegmenter(choice)
     from slomo.reconstruct.motion_segment import MotionSegmenter
 
     return MotionSegmenter(choice)
