@@ -107,6 +107,23 @@ def test_heads_are_carried_high_and_low_and_turned_aside():
     assert np.mean(np.array(aside) > np.radians(40)) > 0.15
 
 
+def test_people_differ_in_front_and_behind():
+    skeleton = load_skeleton("human")
+    link = {n: skeleton.names.index(n) for n in ("head", "chest", "left_ankle")}
+    face, dress, foot = [], [], []
+    for seed in range(12):
+        person = create(skeleton, seed)
+        colors, x = person.colors(np.random.default_rng(seed)), person.surface[:, 0]
+        for found, of in ((face, "head"), (dress, "chest")):
+            front, back = (person.link == link[of]) & (x > 0.03), (person.link == link[of]) & (x < -0.005)
+            found.append(np.abs(colors[front].mean(0) - colors[back].mean(0)).max())
+        ahead = person.vertices[person.link == link["left_ankle"], 0]
+        foot.append(ahead.max() / -ahead.min())
+    assert np.median(face) > 0.15  # hair is behind
+    assert 0.02 < np.median(dress) < 0.3  # some wear something in front, many do not
+    assert min(foot) > 1.2
+
+
 def test_the_labels_agree(shard):
     known, z = shard
     assert np.array_equal(z["parts"] > 0, z["mask"] > 0)

@@ -6,6 +6,7 @@ import numpy as np
 
 from slomo.flesh import value_noise
 from slomo.skeleton import Skeleton
+from slomo.synth.person import dress
 
 Array = np.ndarray
 
@@ -37,22 +38,12 @@ def _pattern(x: Array, rng: np.random.Generator) -> Array:
 def coat(skeleton: Skeleton, link: Array, surface: Array, rng: np.random.Generator) -> Array:
     """(V, 3) sRGB. Args: link: (V,) that carries the vertex.  surface: (V, 3) its canonical coordinates."""
     human = skeleton.kind == "human"
-    base = np.tile(_colour(rng, natural=not human), (len(surface), 1))
-    names = skeleton.names[: skeleton.link_count]
     if human:
-        skin = np.array([0.95, 0.78, 0.66]) * rng.uniform(0.3, 1.0) ** np.array([0.8, 1.0, 1.2])
-        trousers, hair = _colour(rng, natural=False), _colour(rng, natural=True)
-        sleeves, shorts = rng.random() < 0.5, rng.random() < 0.25
-        for j, name in enumerate(names):
-            mine = link == j
-            if any(w in name for w in ("head", "neck")) or ("elbow" in name and not sleeves):
-                base[mine] = skin
-            elif any(w in name for w in ("hip", "pelvis")) or ("knee" in name and not shorts):
-                base[mine] = trousers
-            elif "knee" in name or "ankle" in name:
-                base[mine] = skin
-        base[np.isin(link, [names.index("head")]) & (surface[:, 0] < 0.02)] = hair
+        base, cloth = dress(skeleton, link, surface, rng)
     else:
+        cloth = np.ones(len(surface), bool)
+        base = np.tile(_colour(rng, natural=True), (len(surface), 1))
+        names = skeleton.names[: skeleton.link_count]
         for j in range(len(names)):  # socks, a dark tail, a pale face: each on both sides
             if rng.random() < 0.12:
                 both = [j, skeleton.mirror[j]]
@@ -61,7 +52,7 @@ def coat(skeleton: Skeleton, link: Array, surface: Array, rng: np.random.Generat
             below = np.clip((-0.12 - surface[:, 2] + 0.2 * rng.standard_normal()) / 0.1, 0, 1)[:, None]
             base = base * (1 - below) + _colour(rng, natural=True) * below
     for _ in range(rng.integers(0, 3)):
-        p = _pattern(surface, rng)[:, None] * rng.uniform(0.3, 1.0)
+        p = (_pattern(surface, rng) * cloth)[:, None] * rng.uniform(0.3, 1.0)
         base = base * (1 - p) + _colour(rng, natural=not human) * p
     base *= (1 + rng.uniform(0, 0.4) * (value_noise(surface * 40, rng) - 0.5))[:, None]
     return np.clip(base, 0.02, 0.97)

@@ -7,6 +7,7 @@ import numpy as np
 
 from slomo.prior.labels import labels
 from slomo.skeleton import Skeleton
+from slomo.synth import person
 
 Array = np.ndarray
 
@@ -117,7 +118,7 @@ def build(skeleton: Skeleton, rng: np.random.Generator) -> Build:
 
 
 def extras(skeleton: Skeleton, what: Build, rng: np.random.Generator) -> list[Extra]:
-    """Ears, manes, humps, bellies and hooves; hair, hats, coats, bags and shoes."""
+    """Ears, manes, humps, bellies and hooves; people's are in `slomo.synth.person`."""
     known = labels(skeleton)
     out: list[Extra] = []
     number = {n: i for i, n in enumerate(skeleton.names)}
@@ -132,7 +133,8 @@ def extras(skeleton: Skeleton, what: Build, rng: np.random.Generator) -> list[Ex
 
     u = rng.uniform
     if skeleton.kind == "human":
-        _clothes(add, chance, u, what, number)
+        skull = float(what.radii[list(skeleton.capsule_names).index("skull")].max())
+        person.grow(add, rng, what.offset, skull, number)
         return out
     nose = what.offset[number["nose"]]
     skull = float(what.radii[list(skeleton.capsule_names).index("skull")].max())
@@ -187,30 +189,3 @@ def extras(skeleton: Skeleton, what: Build, rng: np.random.Generator) -> list[Ex
             if furry:
                 add(joint, 0.2 * paw, 0.8 * paw, feather, feather, f"{leg}_lower")
     return out
-
-
-def _clothes(add, chance, u, what: Build, number: dict[str, int]) -> None:
-    top = what.offset[number["head_top"]]
-    if chance(0.6):  # hair
-        r = u(0.045, 0.065)
-        add("head", 0.2 * top + [-0.015, 0, 0], 0.55 * top + [-0.01, 0, 0], r, r, "head")
-        if chance(0.5):  # long
-            add("head", [-0.03, 0, 0.02], [-0.05, 0, -u(0.03, 0.16)], u(0.03, 0.05), u(0.02, 0.045), "head")
-    if chance(0.15):  # a hat
-        add("head", 0.75 * top, 1.15 * top, u(0.045, 0.07), u(0.03, 0.05), "head")
-    if chance(0.25):  # a coat, a skirt
-        r, low = u(0.06, 0.085), u(0.05, 0.2)
-        for y in (0.05, -0.05):
-            add("pelvis", [0, y, 0.02], [0, 1.3 * y, -low], r, r * u(0.9, 1.2), "trunk")
-    if chance(0.15):  # a bag on the back
-        add("chest", [-0.1, 0, -0.1], [-0.1, 0, 0.03], u(0.05, 0.09), u(0.05, 0.08), "trunk")
-    if chance(0.3):  # a bulky jacket
-        add("spine_mid", [0, 0.03, 0], [0, 0.04, 0.12], u(0.07, 0.1), u(0.06, 0.09), "trunk")
-        add("spine_mid", [0, -0.03, 0], [0, -0.04, 0.12], u(0.07, 0.1), u(0.06, 0.09), "trunk")
-    shoe, trousers, wide = u(0.02, 0.035), chance(0.4), u(0.035, 0.065)
-    for side in ("left", "right"):
-        toe = what.offset[number[f"{side}_toe"]]
-        add(f"{side}_ankle", [-0.02, 0, -0.015], toe + [u(0.0, 0.03), 0, 0.01], shoe, 0.9 * shoe, f"{side}_shank")
-        if trousers:
-            shank = what.offset[number[f"{side}_ankle"]]
-            add(f"{side}_knee", 0.1 * shank, 0.95 * shank, wide, wide, f"{side}_shank")
