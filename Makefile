@@ -15,7 +15,7 @@ DEMO   := demo
 CLIP   := src/slomo/assets/walk
 KINDS  := quadruped human
 STEPS_quadruped := 8500
-STEPS_human     := 4000
+STEPS_human     := 7000
 PRIOR  := prior-training
 SHIPPED := src/slomo/prior/weights
 
