@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slomo.errors import UsageError
-from slomo.reconstruct import camera, rotation_ba, sfm
+from slomo.reconstruct import rotation_ba
 from slomo.reconstruct.camera import CameraSettings, estimate_camera
 from slomo.reconstruct.ground import find_ground, gravity_from_lines, up_vector
 from slomo.reconstruct.resection import interpolate_poses
@@ -217,22 +217,3 @@ def test_moving_camera_of_truth_clips(name):
     scale = (S * np.diag(D)).sum() / (a**2).sum()
     assert np.linalg.norm(b - scale * a @ (U @ D @ Vt).T, axis=-1).max() < 0.03
     assert scale == pytest.approx(truth[:, 2, 3].mean(), rel=0.03)
-
-
-@pytest.mark.parametrize(("held_error", "focal", "doubted"), [(0.95, 480.0, True), (1.6, 232.0, False)])
-def test_a_focal_length_that_no_lens_is_likely_to_have_is_held_where_that_is_as_good(
-    monkeypatch, held_error, focal, doubted
-):
-    def structure(frames, masks, keys, *, focal, refine_focal, **_):
-        found, error = (232.0, 0.8) if refine_focal else (focal, held_error)
-        T = np.tile(np.eye(4), (len(keys), 1, 1))
-        empty = np.zeros((0, 2), int)
-        return sfm.Structure(keys, T, found, np.zeros((0, 3)), empty, empty.astype(float), error, 1.5)
-
-    monkeypatch.setattr(sfm, "reconstruct_structure", structure)
-    settings = camera.CameraSettings(480.0, 96.0, True, key_every=3, features=10, overlap=2, seed=0)
-    frames, report = np.zeros((30, 8, 8, 3), np.uint8), {}
-    found = camera._structure(frames, np.zeros((30, 8, 8), bool), np.arange(30) / 30, settings, report, Silent())
-    assert found is not None
-    assert found.focal == focal
-    assert report["focal_doubted"] == doubted

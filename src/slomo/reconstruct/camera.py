@@ -23,8 +23,6 @@ _LEAST_CORNERS = 12  # in a frame, in the median, below which the background say
 _MOST_KEYS = 120  # key frames that are enough for any clip, as long as none is farther from the next than this:
 _KEY_GAP = 0.5  # s
 _MOST_GUESSED = 0.05  # part of the frames whose camera may be interpolated without a word
-_UNLIKELY = 2.5  # standard deviations of the focal length's logarithm, from which on a refined one is doubted
-_AS_GOOD = 1.3  # of its reprojection error, up to which the usual focal length is taken instead
 _MOST_PAIRS = 24_000  # correspondences for a turning camera, drawn from those there are
 
 
@@ -78,8 +76,8 @@ def estimate_camera(
                 f"camera: moving (structure from motion, {len(structure.frames)} of {report['key_frames']} key frames, "
                 f"{structure.error_px:.2f} px, focal {structure.focal:.0f} px)"
             )
-            report["focal_observed"] = observed = settings.refine_focal and not report["focal_doubted"]
-            std = certainty.focal_std(structure, center) if observed else settings.focal_std
+            report["focal_observed"] = settings.refine_focal
+            std = certainty.focal_std(structure, center) if settings.refine_focal else settings.focal_std
             path = moving(frames, masks, structure, std, center, report)
             if (guessed := len(frames) - path.report["frames_measured"]) > _MOST_GUESSED * len(frames):
                 path.report["fallback"] = f"the camera of {guessed} of {len(frames)} frames is interpolated"
@@ -125,7 +123,6 @@ def _structure(frames, masks, t, s: CameraSettings, report: dict[str, Any], prog
     if (saved := progress.load()) is not None:
         structure = sfm.Structure.of(saved)
         report |= {"key_frames": int(saved["key_frames"]), "key_frames_registered": len(structure.frames)}
-        report["focal_doubted"] = bool(saved["focal_doubted"])
         return structure
     tried = 0
     for most in (_MOST_KEYS, 2 * _MOST_KEYS):
@@ -133,36 +130,23 @@ def _structure(frames, masks, t, s: CameraSettings, report: dict[str, Any], prog
         if len(keys) == tried:
             break
         tried = len(keys)
-        solve = partial(
-            sfm.reconstruct_structure,
+        structure = sfm.reconstruct_structure(
             frames,
             masks,
             keys,
             focal=s.focal,
+            refine_focal=s.refine_focal,
             features=s.features,
             overlap=s.overlap,
             seed=s.seed,
             waiting=partial(_waiting, progress, 1.5 * tried),
         )
-        structure, report["focal_doubted"] = solve(refine_focal=s.refine_focal), False
-        if structure is not None and s.refine_focal and _unlikely(structure.focal, s):
-            # Where the motion shows little of it, a wrong focal length bends the path and explains the pictures too.
-            held = solve(refine_focal=False)
-            enough = held is not None and len(held.frames) >= sfm.ENOUGH * len(keys)
-            if held is not None and enough and held.error_px < _AS_GOOD * structure.error_px:
-                structure, report["focal_doubted"] = held, True
         registered = 0 if structure is None else len(structure.frames)
         report |= {"key_frames": len(keys), "key_frames_registered": registered}
         if structure is not None and registered >= sfm.ENOUGH * len(keys):
-            more = {"key_frames": np.array(len(keys)), "focal_doubted": np.array(report["focal_doubted"])}
-            progress.save(structure.arrays() | more)
+            progress.save(structure.arrays() | {"key_frames": np.array(len(keys))})
             return structure
     return None
-
-
-def _unlikely(focal: float, s: CameraSettings) -> bool:
-    """Whether a focal length is far from what was expected."""
-    return abs(np.log(focal / s.focal)) > _UNLIKELY * s.focal_std / s.focal
 
 
 def _waiting(progress, usual: float, took: float) -> None:
