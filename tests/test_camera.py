@@ -8,7 +8,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slomo.errors import UsageError
-from slomo.reconstruct import rotation_ba
 from slomo.reconstruct.camera import CameraSettings, estimate_camera
 from slomo.reconstruct.ground import find_ground, gravity_from_lines, up_vector
 from slomo.reconstruct.resection import interpolate_poses
@@ -57,28 +56,6 @@ def settings(focal: float, **changes) -> CameraSettings:
         "seed": 0,
     }
     return CameraSettings(focal=focal, **(defaults | changes))
-
-
-def test_jacobian_against_finite_differences():
-    rng = np.random.default_rng(3)
-    R = Rotation.random(2, random_state=4).as_matrix()
-    R[1] = R[0] @ Rotation.from_rotvec([0.1, -0.2, 0.05]).as_matrix()
-    x, y = rng.uniform(-150, 150, (2, 5, 2))
-    i, j = np.zeros(5, int), np.ones(5, int)
-    focal, e = 400.0, 1e-6
-    _, jacobian = rotation_ba._linearise(R, focal, x, y, i, j)
-    for column in range(7):
-        sides = []
-        for sign in (1, -1):
-            R2, f2 = R.copy(), focal
-            if column < 6:
-                turn = np.zeros(3)
-                turn[column % 3] = sign * e
-                R2[column // 3] = R[column // 3] @ Rotation.from_rotvec(turn).as_matrix()
-            else:
-                f2 = focal * np.exp(sign * e)
-            sides.append(rotation_ba._linearise(R2, f2, x, y, i, j)[0])
-        np.testing.assert_allclose(jacobian[:, :, column], (sides[0] - sides[1]) / (2 * e), rtol=1e-5, atol=1e-4)
 
 
 def test_panning_camera_and_focal_are_found():

@@ -140,13 +140,13 @@ def test_structure_from_motion_that_falls_to_pieces_is_named(monkeypatch):
     tried = []
 
     def pieces(frames, masks, keys, **options):
-        tried.append(len(keys))
+        tried.append((len(keys), options["path"] is not None))
         return None
 
     monkeypatch.setattr(sfm, "reconstruct_structure", pieces)
     frames = layers(45)
     path = estimate_camera(frames, np.zeros(frames.shape[:3], bool), np.arange(45) / 30, settings(300.0), Silent())
-    assert tried == [16]
+    assert tried == [(16, True), (16, False)]  # from the tracks' path, then from a pair of frames
     assert path.report["parallax_px"] > path.report["parallax_limit_px"]
     assert path.report["mode"] == "panning"
     assert path.report["fallback"] == "structure from motion placed 0 of 16 key frames"

@@ -13,6 +13,7 @@ import numpy as np
 
 from slomo.reconstruct import certainty, rotation_ba, sfm
 from slomo.reconstruct.camera_world import CameraPath, moving, turning
+from slomo.reconstruct.tracked_path import Epipolar, track_path
 from slomo.reconstruct.tracks import Tracks, background_tracks
 
 Pairs = tuple[np.ndarray, np.ndarray, np.ndarray]  # of correspondences, see Tracks.pairs
@@ -23,6 +24,8 @@ _LEAST_CORNERS = 12  # in a frame, in the median, below which the background say
 _MOST_KEYS = 120  # key frames that are enough for any clip, as long as none is farther from the next than this:
 _KEY_GAP = 0.5  # s
 _MOST_GUESSED = 0.05  # part of the frames whose camera may be interpolated without a word
+_IN_FRONT = 0.97  # part of the tracks' sightings whose points must lie before the camera, for a path to be used
+_AGREES = 1.3  # of its epipolar cost, up to which bundle adjustment with other corners has kept it
 _MOST_PAIRS = 24_000  # correspondences for a turning camera, drawn from those there are
 
 
@@ -70,7 +73,7 @@ def estimate_camera(
     report |= {"parallax_px": parallax, "parallax_limit_px": limit}
     progress.update(0.2, f"residual of a turning camera {parallax:.2f} px")
     if parallax > limit:
-        structure = _structure(frames, masks, t, settings, report, progress)
+        structure = _structure(frames, masks, t, tracks, fit.R_world_cam, settings, report, progress)
         if structure is not None:
             progress.note(
                 f"camera: moving (structure from motion, {len(structure.frames)} of {report['key_frames']} key frames, "
@@ -117,20 +120,23 @@ def _key_frames(t: np.ndarray, every: int, most: int = _MOST_KEYS) -> tuple[np.n
     return np.array(sorted({*range(0, len(t), every), len(t) - 1})), gaps
 
 
-def _structure(frames, masks, t, s: CameraSettings, report: dict[str, Any], progress) -> sfm.Structure | None:
-    """Structure from motion of the key frames, once more with twice as many of them where they were thinned; None when
-    too few are placed. The report says how many. A structure is kept in a checkpoint."""
+def _structure(
+    frames, masks, t, tracks: Tracks, turning_R: np.ndarray, s: CameraSettings, report: dict[str, Any], progress
+) -> sfm.Structure | None:
+    """Structure from motion of the key frames: from the path that the tracks give, and where that does not hold, from a
+    pair of frames, once more with twice as many of them where they were thinned; None when too few are placed. The
+    report says how many, and which it is. A structure is kept in a checkpoint."""
     if (saved := progress.load()) is not None:
         structure = sfm.Structure.of(saved)
         report |= {"key_frames": int(saved["key_frames"]), "key_frames_registered": len(structure.frames)}
+        report["structure_start"] = str(saved["structure_start"])
         return structure
-    tried = 0
-    for most in (_MOST_KEYS, 2 * _MOST_KEYS):
-        keys, _ = _key_frames(t, s.key_every, most)
-        if len(keys) == tried:
-            break
-        tried = len(keys)
-        structure = sfm.reconstruct_structure(
+    h, w = frames.shape[1:3]
+    center = np.array([(w - 1) / 2, (h - 1) / 2])
+    keys, gaps = _key_frames(t, s.key_every)
+
+    def solve(keys: np.ndarray, path: np.ndarray | None = None) -> sfm.Structure | None:
+        return sfm.reconstruct_structure(
             frames,
             masks,
             keys,
@@ -139,13 +145,32 @@ def _structure(frames, masks, t, s: CameraSettings, report: dict[str, Any], prog
             features=s.features,
             overlap=s.overlap,
             seed=s.seed,
-            waiting=partial(_waiting, progress, 1.5 * tried),
+            path=path,
+            waiting=partial(_waiting, progress, 1.5 * len(keys)),
         )
-        registered = 0 if structure is None else len(structure.frames)
-        report |= {"key_frames": len(keys), "key_frames_registered": registered}
-        if structure is not None and registered >= sfm.ENOUGH * len(keys):
-            progress.save(structure.arrays() | {"key_frames": np.array(len(keys))})
-            return structure
+
+    def done(structure: sfm.Structure, keys: np.ndarray, start: str) -> sfm.Structure:
+        report.update(key_frames=len(keys), key_frames_registered=len(structure.frames), structure_start=start)
+        more = {"key_frames": np.array(len(keys)), "structure_start": np.array(start)}
+        progress.save(structure.arrays() | more)
+        return structure
+
+    epipolar = Epipolar(tracks, keys, gaps, center, s.seed)
+    if epipolar.least_shared >= _LEAST_CORNERS:
+        path = track_path(epipolar, tracks, keys, center, s.focal, s.seed, turning_R)
+        structure = solve(keys, path.T_world_cam) if path.in_front > _IN_FRONT else None
+        if structure and epipolar.cost(structure.T_world_cam, structure.focal) < _AGREES * path.cost:
+            return done(structure, keys, "tracks")
+    tried = 0
+    for most in (_MOST_KEYS, 2 * _MOST_KEYS):
+        more, _ = _key_frames(t, s.key_every, most)
+        if len(more) == tried:
+            break
+        tried = len(more)
+        structure = solve(more)
+        report |= {"key_frames": tried, "key_frames_registered": 0 if structure is None else len(structure.frames)}
+        if structure is not None and len(structure.frames) >= sfm.ENOUGH * tried:
+            return done(structure, more, "pair")
     return None
 
 

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from slomo.reconstruct.pairwise import minimise
+
 
 @dataclass(frozen=True)
 class RotationFit:
@@ -35,54 +37,38 @@ def fit_rotations(
     center: np.ndarray,
     focal: float,
     refine_focal: bool,
-    iterations: int = 40,
-    huber: float = 0.5,
 ) -> RotationFit:
     """Fit rotations of `count` frames to correspondences.
 
     Args:
         which: (P, 2) frames of each pair.  first, second: (P, 2) px.
         center: (2,) px, principal point.  focal: px, start (and result when not `refine_focal`).
-        huber: px, where the loss turns linear.
     """
-    R = np.tile(np.eye(3), (count, 1, 1))
     x, y = first - center, second - center
     i, j = which.T
-    damping, cost = 1e-3, np.inf
-    best = (R, focal)
-    for _ in range(iterations):
-        residual, jacobian = _linearise(R, focal, x, y, i, j)
-        length = np.linalg.norm(residual, axis=-1)
-        weight = np.minimum(1.0, huber / np.maximum(length, 1e-9))
-        new_cost = float(np.where(length < huber, 0.5 * length**2, huber * (length - 0.5 * huber)).sum())
-        if new_cost < cost:
-            done = cost - new_cost < 1e-7 * new_cost
-            best, cost, damping = (R, focal), new_cost, damping / 5
-            hessian, gradient = _normal_equations(residual, jacobian, weight, i, j, count)
-            if done:
-                break
-        else:
-            damping *= 10
-            if damping > 1e6:
-                break
-        free = np.arange(3, 3 * count + int(refine_focal))  # the first rotation is the gauge
-        H = hessian[np.ix_(free, free)]
-        step = np.zeros(3 * count + 1)
-        step[free] = -np.linalg.solve(H + damping * np.diag(np.diag(H)) + 1e-9 * np.eye(len(free)), gradient[free])
-        R = best[0] @ Rotation.from_rotvec(step[:-1].reshape(-1, 3)).as_matrix()
-        focal = best[1] * float(np.exp(np.clip(step[-1], -0.3, 0.3)))
-    R, focal = best
-    residual, jacobian = _linearise(R, focal, x, y, i, j)
-    length = np.linalg.norm(residual, axis=-1)
+
+    def move(state, step):
+        R, focal = state
+        turned = R @ Rotation.from_rotvec(step[:-1].reshape(-1, 3)).as_matrix()
+        return turned, focal * float(np.exp(np.clip(step[-1], -0.3, 0.3)))
+
+    found = minimise(
+        (np.tile(np.eye(3), (count, 1, 1)), focal),
+        lambda state: _linearise(state[0], state[1], x, y, i, j),
+        move,
+        i,
+        j,
+        count,
+        np.arange(3, 3 * count + int(refine_focal)),  # the first rotation is the gauge
+    )
+    R, focal = found.state
     std = np.inf
     if refine_focal:
-        weight = np.minimum(1.0, huber / np.maximum(length, 1e-9))
-        H, _ = _normal_equations(residual, jacobian, weight, i, j, count)
-        sigma = 1.4826 * float(np.median(abs(residual)))
+        sigma = 1.4826 * float(np.median(abs(found.residual)))
         # Correspondences of one track are not independent: counted as if every track gave ten of them.
-        covariance = np.linalg.pinv(H[3:, 3:], rcond=1e-14) * max(sigma, 0.05) ** 2 * 10
+        covariance = np.linalg.pinv(found.hessian[3:, 3:], rcond=1e-14) * max(sigma, 0.05) ** 2 * 10
         std = focal * float(np.sqrt(max(covariance[-1, -1], 0.0)))
-    return RotationFit(R, focal, std, length)
+    return RotationFit(R, focal, std, np.linalg.norm(found.residual, axis=-1))
 
 
 def rotation_between(R_world: np.ndarray, focal: float, center: np.ndarray, seen: np.ndarray, now: np.ndarray):
@@ -116,32 +102,15 @@ def _linearise(R, focal, x, y, i, j):
     projection[:, 0, 0] = projection[:, 1, 1] = focal / z
     projection[:, :, 2] = -focal * u / z[:, None]
     jacobian = np.empty((len(x), 2, 7))
-    jacobian[:, :, :3] = -projection @ Rij @ _skew(ray)
-    jacobian[:, :, 3:6] = projection @ _skew(d)
+    jacobian[:, :, :3] = -projection @ Rij @ skew(ray)
+    jacobian[:, :, 3:6] = projection @ skew(d)
     by_focal = np.einsum("pab,pb->pa", Rij, np.column_stack([-x / focal, np.zeros(len(x))]))
     jacobian[:, :, 6] = np.einsum("pab,pb->pa", projection, by_focal) + focal * u
     return focal * u - y, jacobian
 
 
-def _skew(v: np.ndarray) -> np.ndarray:
+def skew(v: np.ndarray) -> np.ndarray:
+    """Matrices (P, 3, 3) of the cross product with v (P, 3)."""
     out = np.zeros((len(v), 3, 3))
     out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
     return out - np.swapaxes(out, 1, 2)
-
-
-def _normal_equations(residual, jacobian, weight, i, j, count):
-    """J^T W J and J^T W r over 3 parameters a frame and log focal last."""
-    size = 3 * count + 1
-    H, g = np.zeros((size, size)), np.zeros(size)
-    # Thousands of correspondences share a pair of frames: they are summed before they are put in their places.
-    order = np.lexsort((j, i))
-    i, j, jacobian = i[order], j[order], jacobian[order]
-    starts = np.flatnonzero(np.r_[True, (np.diff(i) != 0) | (np.diff(j) != 0)])
-    weighted = jacobian * weight[order, None, None]
-    blocks = np.add.reduceat(np.swapaxes(weighted, 1, 2) @ jacobian, starts, axis=0)
-    slopes = np.add.reduceat((weighted * residual[order, :, None]).sum(1), starts, axis=0)
-    for a, b, block, slope in zip(i[starts], j[starts], blocks, slopes, strict=True):
-        columns = np.r_[3 * a : 3 * a + 3, 3 * b : 3 * b + 3, size - 1]
-        H[np.ix_(columns, columns)] += block
-        g[columns] += slope
-    return H, g

@@ -28,6 +28,7 @@ ENOUGH = 0.6  # part of the key frames that a model must hold to be used
 # Degrees between rays, of the first pair and of any point. COLMAP's usual ones give the better structure; a hand-held
 # clip that turns more than it travels has no points left at those.
 _ANGLES = ((16.0, 1.5), (4.0, 0.4))
+_ROUNDS = 3  # of points and bundle adjustment, from a path that is known
 _ENOUGH_POINTS = 10  # points for each key frame, below which the next angles are tried
 # Seconds of a mapping at most, by the clock: a net for one that does not end, which a busy machine must not run into.
 _MAX_SECONDS, _MAX_SECONDS_EACH = 180, 8.0  # at least, and for each key frame
@@ -79,6 +80,7 @@ def reconstruct_structure(
     overlap: int,
     seed: int = 0,
     threads: int = 1,
+    path: np.ndarray | None = None,
     waiting: Callable[[float], None] = lambda seconds: None,
 ) -> Structure | None:
     """Cameras of the frames `keys` and sparse points of what is not masked; None when COLMAP finds no model.
@@ -87,6 +89,7 @@ def reconstruct_structure(
         frames: (T, H, W, 3) uint8 RGB.  masks: (T, H, W) bool, left out.
         focal: px, start, kept when not `refine_focal`.  features: per frame.  overlap: frames matched with each.
         threads: of COLMAP; with more than one, each run gives slightly other numbers.
+        path: (N, 4, 4) cameras of `keys` that are known but for a little; without, they are found.
         waiting: called twice a second with the seconds that it has taken; what it raises ends the process.
 
     Raises:
@@ -101,9 +104,9 @@ def reconstruct_structure(
         (root / "masks").mkdir()
         around = np.ones((9, 9), np.uint8)
         for k in keys:
-            cv2.imwrite(str(root / "images" / f"{k:06d}.png"), frames[k][..., ::-1])
+            cv2.imwrite(str(root / "images" / _name(k)), frames[k][..., ::-1])
             free = 255 - 255 * cv2.dilate(masks[k].astype(np.uint8), around)
-            cv2.imwrite(str(root / "masks" / f"{k:06d}.png.png"), free)
+            cv2.imwrite(str(root / "masks" / f"{_name(k)}.png"), free)
         height, width = frames.shape[1:3]
         job = {
             "focal": focal,
@@ -113,6 +116,7 @@ def reconstruct_structure(
             "overlap": overlap,
             "seed": seed,
             "threads": threads,
+            "path": None if path is None else {_name(k): T.tolist() for k, T in zip(keys, path, strict=True)},
         }
         (root / "job.json").write_text(json.dumps(job))
         status = _run([sys.executable, "-m", "slomo.reconstruct.sfm", folder], root / "errors.txt", waiting)
@@ -123,6 +127,10 @@ def reconstruct_structure(
             return None
         with np.load(root / "out.npz") as z:
             return Structure.of({k: z[k] for k in z.files})
+
+
+def _name(key: int) -> str:
+    return f"{key:06d}.png"
 
 
 def _run(command: list[str], errors: Path, waiting: Callable[[float], None]) -> int:
@@ -200,27 +208,75 @@ def _main(folder: str) -> None:
     pairing = pycolmap.SequentialPairingOptions()
     pairing.overlap, pairing.quadratic_overlap, pairing.num_threads = job["overlap"], True, job["threads"]
     pycolmap.match_sequential(database, matching_options=matching, pairing_options=pairing)
+    find = _mapped if job["path"] is None else _placed
+    model, angle = find(root, database, images, job)
+    if model is not None:
+        np.savez(root / "out.npz", allow_pickle=False, least_angle=np.array(angle), **_arrays(model))
+
+
+def _mapping(job: dict[str, Any], count: int, first_angle: float, angle: float):
+    import pycolmap
+
+    mapping = pycolmap.IncrementalPipelineOptions()
+    mapping.num_threads, mapping.random_seed = job["threads"], job["seed"]
+    # A first pair that leads nowhere is dropped and another is tried, which only happens with several models.
+    mapping.multiple_models, mapping.max_num_models, mapping.extract_colors = True, 3, False
+    mapping.max_runtime_seconds = round(max(_MAX_SECONDS, _MAX_SECONDS_EACH * count))
+    mapping.mapper.filter_min_tri_angle = mapping.triangulation.min_angle = angle
+    mapping.mapper.init_min_tri_angle = first_angle
+    mapping.ba_refine_focal_length = job["refine_focal"]
+    return mapping
+
+
+def _mapped(root: Path, database: Path, images: Path, job: dict[str, Any]):
+    """The best model that grows from a pair of frames, and its least angle."""
+    import pycolmap
+
     count = len(list(images.iterdir()))
-    best, best_rank = None, (False, False, 0)
+    best, best_angle, best_rank = None, 0.0, (False, False, 0)
     for first_angle, angle in _ANGLES:
-        mapping = pycolmap.IncrementalPipelineOptions()
-        mapping.num_threads, mapping.random_seed = job["threads"], job["seed"]
-        # A first pair that leads nowhere is dropped and another is tried, which only happens with several models.
-        mapping.multiple_models, mapping.max_num_models, mapping.extract_colors = True, 3, False
-        mapping.max_runtime_seconds = round(max(_MAX_SECONDS, _MAX_SECONDS_EACH * count))
-        mapping.mapper.filter_min_tri_angle = mapping.triangulation.min_angle = angle
-        mapping.mapper.init_min_tri_angle = first_angle
-        mapping.ba_refine_focal_length = job["refine_focal"]
-        models = pycolmap.incremental_mapping(database, images, root, mapping)
+        models = pycolmap.incremental_mapping(database, images, root, _mapping(job, count, first_angle, angle))
         for model in models.values():
-            registered = model.num_reg_images()
-            rank = (registered >= ENOUGH * count, model.num_points3D() >= _ENOUGH_POINTS * registered, registered)
+            rank = _rank(model, count)
             if rank[:2] > best_rank[:2] or (rank[:2] == best_rank[:2] == (False, False) and rank > best_rank):
-                best, best_rank = (model, angle), rank
+                best, best_angle, best_rank = model, angle, rank
         if all(best_rank[:2]):
             break
-    if best:
-        np.savez(root / "out.npz", allow_pickle=False, least_angle=np.array(best[1]), **_arrays(best[0]))
+    return best, best_angle
+
+
+def _rank(model, count: int) -> tuple[bool, bool, int]:
+    """Whether there are enough frames and points, and how many frames."""
+    registered = model.num_reg_images()
+    return registered >= ENOUGH * count, model.num_points3D() >= _ENOUGH_POINTS * registered, registered
+
+
+def _placed(root: Path, database: Path, images: Path, job: dict[str, Any]):
+    """A model whose cameras are known but for a little, and its least angle."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as db:
+        found, camera = db.read_all_images(), db.read_all_cameras()[0]
+    camera.params = [job["focal"], *job["center"]]
+    best, best_angle = None, 0.0
+    for _, angle in _ANGLES:
+        model = pycolmap.Reconstruction()
+        model.add_camera_with_trivial_rig(camera)
+        for image in found:
+            T = np.linalg.inv(np.array(job["path"][image.name]))
+            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(T[:3]))
+        mapping = _mapping(job, len(found), 0.0, angle)
+        adjustment = pycolmap.BundleAdjustmentOptions()
+        adjustment.refine_focal_length = job["refine_focal"]
+        adjustment.print_summary = False
+        for _ in range(_ROUNDS):
+            model = pycolmap.triangulate_points(model, database, images, root, options=mapping)
+            pycolmap.bundle_adjustment(model, adjustment)
+        model.normalize()
+        best, best_angle = model, angle
+        if model.num_points3D() >= _ENOUGH_POINTS * len(found):
+            break
+    return best, best_angle
 
 
 def _arrays(model) -> dict[str, np.ndarray]:

@@ -14,7 +14,7 @@ from slomo.stage import Artifact, Inputs, Progress
 
 DECODE_VERSION = 2
 MASKS_VERSION = 6
-CAMERA_VERSION = 4
+CAMERA_VERSION = 5
 
 SEGMENTERS = ("auto", "u2netp", "still", "motion", "user")
 _LOST = 0.05  # part of the frames without the subject, from which on the other masks are taken

@@ -147,7 +147,7 @@ def dress(skeleton: Skeleton, link: Array, surface: Array, rng: np.random.Genera
 
 
 def _face(head: Array, at: Array, color: Array, skin: Array, rng: np.random.Generator) -> None:
-    """Paint the vertices `head` (V,) of `color` (V, 3). Args: at: (V, 3) canonical coordinates about the head's joint."""
+    """Paint the vertices `head` (V,) of `color` (V, 3); `at` (V, 3) are their coordinates about the head's joint."""
     u = rng.uniform
     x, y, z = at.T
     hair, ahead = _hair_colour(rng), head & (x > 0.02)

@@ -1,0 +1,98 @@
+"""Cameras that are compared two by two: derivatives, and the path of a moving camera from tracks alone."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from slomo.reconstruct import rotation_ba
+from slomo.reconstruct.tracked_path import Epipolar, track_path
+from slomo.reconstruct.tracks import Tracks
+
+FOCAL, CENTER = 500.0, np.array([239.5, 134.5])
+
+
+def finite_differences(linearise, R, p, focal, by_frame):
+    """Derivatives by turn (and shift if `by_frame` is 6) of each of two frames, and the focal length's logarithm."""
+    columns, e = [], 1e-6
+    for column in range(2 * by_frame + 1):
+        sides = []
+        for sign in (1, -1):
+            R2, p2, f2 = R.copy(), p.copy(), focal
+            frame, place = divmod(column, by_frame)
+            step = sign * e * np.eye(3)[place % 3]
+            if frame == 2:
+                f2 = focal * np.exp(sign * e)
+            elif place < 3:
+                R2[frame] = R[frame] @ Rotation.from_rotvec(step).as_matrix()
+            else:
+                p2[frame] = p[frame] + step
+            sides.append(linearise(R2, p2, f2)[0])
+        columns.append((sides[0] - sides[1]) / (2 * e))
+    return np.stack(columns, -1)
+
+
+def two_frames():
+    rng = np.random.default_rng(3)
+    R = Rotation.random(2, random_state=4).as_matrix()
+    R[1] = R[0] @ Rotation.from_rotvec([0.1, -0.2, 0.05]).as_matrix()
+    return R, rng.normal(0, 1, (2, 3)), rng.uniform(-150, 150, (2, 5, 2)), (np.zeros(5, int), np.ones(5, int))
+
+
+def test_jacobian_of_a_turning_camera_against_finite_differences():
+    R, p, (x, y), (i, j) = two_frames()
+    _, jacobian = rotation_ba._linearise(R, FOCAL, x, y, i, j)
+    slow = finite_differences(lambda R, p, f: rotation_ba._linearise(R, f, x, y, i, j), R, p, FOCAL, 3)
+    np.testing.assert_allclose(jacobian, slow, rtol=1e-5, atol=1e-4)
+
+
+def test_jacobian_of_the_epipolar_constraint_against_finite_differences():
+    R, p, (x, y), (i, j) = two_frames()
+    epipolar = object.__new__(Epipolar)
+    epipolar.x, epipolar.y, epipolar.i, epipolar.j = x, y, i, j
+    _, jacobian = epipolar.linearise((R, p, FOCAL))
+    slow = finite_differences(lambda *state: epipolar.linearise(state), R, p, FOCAL, 6)
+    np.testing.assert_allclose(jacobian, slow, rtol=1e-5, atol=1e-4)
+
+
+def retreating(seed: int, degrees: float):
+    """A camera that goes backwards, turns by `degrees` and sees nothing but the ground: R (T, 3, 3), p (T, 3), and its
+    tracks, a tenth of them wrong."""
+    rng = np.random.default_rng(seed)
+    T = 24
+    along = np.linspace(0, 1, T)
+    p = np.column_stack([0.3 * along + 0.02 * np.sin(9 * along), 0.02 * np.cos(7 * along), -1.2 * along])
+    R = Rotation.from_euler("yx", np.column_stack([degrees * along, -12 + 1.5 * np.sin(8 * along)]), degrees=True)
+    ground = np.column_stack([rng.uniform(-8, 8, 1500), np.full(1500, 0.5), rng.uniform(0.6, 14, 1500)])
+    frame, track, xy = [], [], []
+    for t in range(T):
+        X = (ground - p[t]) @ R[t].as_matrix()
+        uv = FOCAL * X[:, :2] / X[:, 2:] + CENTER + rng.normal(0, 0.15, (len(X), 2))
+        seen = np.flatnonzero((X[:, 2] > 0.2) & (uv >= 0).all(-1) & (uv < [480, 270]).all(-1))
+        wrong = seen % 10 == 0
+        uv[seen[wrong]] += rng.normal(0, 4, (wrong.sum(), 2))
+        frame.append(np.full(len(seen), t))
+        track.append(seen)
+        xy.append(uv[seen])
+    return R.as_matrix(), p, Tracks(*(np.concatenate(column) for column in (frame, track, xy)))
+
+
+@pytest.mark.parametrize(("seed", "degrees"), [(0, 14.0), (1, -8.0), (2, 40.0)])
+def test_path_before_one_plane(seed, degrees):
+    """A plane, before which incremental structure from motion may take the wrong one of two motions."""
+    R, p, tracks = retreating(seed, degrees)
+    keys = np.arange(len(R))
+    epipolar = Epipolar(tracks, keys, (1, 3, 8, 16), CENTER, 0)
+    assert epipolar.least_shared > 20
+    turning = rotation_ba.fit_rotations(
+        *tracks.pairs((1, 3, 8, 16), keys), len(keys), center=CENTER, focal=FOCAL, refine_focal=False
+    )
+    path = track_path(epipolar, tracks, keys, CENTER, FOCAL, 0, turning.R_world_cam)
+    turned = Rotation.from_matrix(path.T_world_cam[:, :3, :3]) * Rotation.from_matrix(R[0].T @ R).inv()
+    assert np.degrees(turned.magnitude()).max() < 1.0
+    assert path.in_front > 0.97
+    truth = (p - p[0]) @ R[0]
+    scale = np.linalg.norm(truth[-1]) / np.linalg.norm(path.T_world_cam[-1, :3, 3])
+    assert np.linalg.norm(scale * path.T_world_cam[:, :3, 3] - truth, axis=-1).max() < 0.1
+    T = np.tile(np.eye(4), (len(R), 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = R, p
+    assert path.cost < 1.1 * epipolar.cost(T, FOCAL)
