@@ -104,6 +104,19 @@ def test_convex_mpc_keeps_to_the_schedule_and_steps_after_a_push(lift):
     np.testing.assert_allclose(plan.q[:, 10:12], np.tile(FEET[1, :2], (11, 1)), atol=1e-9)
 
 
+def test_convex_mpc_carries_a_body_that_is_off_its_place(stand):
+    """The feet have stayed: forces are to balance about where the body is, not only in the first step."""
+    mpc = ConvexMpc(MODEL, stand, terrain=Terrain(), config=MpcConfig())
+    q = stand.q[0].copy()
+    q[1] += 0.05
+    plan = mpc.step(0.1, q, stand.v[0])
+    np.testing.assert_allclose(plan.q[:, 7:], np.tile(q[7:], (11, 1)), atol=1e-9)
+    assert plan.q[-1, 1] < q[1] - 0.02
+    centre = (MODEL.mass * plan.q[:-1, :3] + MODEL.foot_mass @ FEET) / MODEL.total_mass
+    moment = np.cross(FEET - centre[:, None], plan.lam).sum(axis=1)
+    assert np.all(np.abs(moment[:2, 0]) < 0.25 * MODEL.total_mass * MODEL.g * 0.05)
+
+
 def test_convex_mpc_keeps_its_plan_without_a_state(stand):
     mpc = ConvexMpc(MODEL, stand, terrain=Terrain(), config=MpcConfig())
     good = mpc.step(0.1, stand.q[0], stand.v[0])

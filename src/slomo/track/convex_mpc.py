@@ -1,7 +1,8 @@
 """Convex model-predictive control with the reference's contact schedule: a baseline.
 
 Di Carlo et al., "Dynamic locomotion in the MIT Cheetah 3 through convex model-predictive control" (IROS 2018): one
-rigid body, small roll and pitch, lever arms and heading of the reference, so that forces enter linearly,
+rigid body, small roll and pitch, heading of the reference, lever arms of feet where they will be from a body that moves
+as the reference does, so that forces enter linearly,
 
     Theta' = R_z^T w,   p' = v,   I w' = sum_c r_c x f_c,   m v' = sum_c f_c + m g     (their eq. 17),
 
@@ -77,8 +78,9 @@ class ConvexMpc:
 
         x_ref, x0 = self._body_states(q_ref, v_ref, q_ref[0, 3:7]), self._body_states(q[None], v[None], q_ref[0, 3:7])
         feet = self._feet(t, knots, q, x0[0], x_ref[0], q_ref)
-        points = np.concatenate([q[None, 7:], q_ref[1:, 7:]]).reshape(H + 1, C, 3)
-        arms = points[:-1] - np.concatenate([x0[:, 3:6], x_ref[1:-1, 3:6]])[:, None]
+        # From where the body is, not from the reference: a body that has come off its place over standing feet has
+        # other arms, and forces that balance on the reference's tip it over.
+        arms = (feet - (x_ref + x0 - x_ref[0])[:, None, 3:6])[:-1]
         problem = _condensed(x0[0], x_ref[:, 2], arms, self._mass.sum(), self._inertia, self.model.g, h)
         forces = self._solve(problem, x_ref[1:], forces_ref, stance)
         if forces is None:
