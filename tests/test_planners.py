@@ -117,6 +117,19 @@ def test_convex_mpc_carries_a_body_that_is_off_its_place(stand):
     assert np.all(np.abs(moment[:2, 0]) < 0.25 * MODEL.total_mass * MODEL.g * 0.05)
 
 
+def test_convex_mpc_does_not_put_off_where_feet_should_be(lift):
+    mpc = ConvexMpc(MODEL, lift, terrain=Terrain(), config=MpcConfig())
+    mpc.step(0.25, lift.q[5], lift.v[5])
+    q = lift.q[9].copy()
+    q[7:9] -= 0.03
+    q[9] = 0.0
+    swinging = mpc.step(0.45, q, lift.v[9]).at(0.45).points[0]
+    np.testing.assert_allclose(swinging, lift.q[9, 7:10], atol=2e-3)
+    q[9] = 0.02  # still in the air when it should stand
+    landed = mpc.step(0.62, q, lift.v[12]).at(0.64).points[0]
+    np.testing.assert_allclose(landed, [q[7], q[8], 0.0], atol=2e-3)
+
+
 def test_convex_mpc_keeps_its_plan_without_a_state(stand):
     mpc = ConvexMpc(MODEL, stand, terrain=Terrain(), config=MpcConfig())
     good = mpc.step(0.1, stand.q[0], stand.v[0])

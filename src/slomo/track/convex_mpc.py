@@ -95,7 +95,8 @@ class ConvexMpc:
         q_plan[:, 3:7], v_plan[:, 3:6] = R.as_quat(), R.inv().apply(x[:, 6:9])
         q_plan[:, 7:] = feet.reshape(H + 1, -1)
         v_plan[1:, 6:] = np.diff(q_plan[:, 7:], axis=0) / h
-        q_plan[0], v_plan[0] = q, v
+        # Not the measured feet: made anew at every tick, the way from there would never leave them.
+        q_plan[0, :7], v_plan[0] = q[:7], v
         # What a foot does to the body: the ground's force less its own weight, or in the air what swings it.
         gravity = self.model.foot_mass[:, None] * [0.0, 0.0, -self.model.g]
         swing = np.where(stance[..., None], 0.0, u_ref.reshape(H, C, 3) - gravity)
@@ -134,7 +135,8 @@ class ConvexMpc:
         """
         now, want = q[7:].reshape(-1, 3), q_ref[:, 7:].reshape(len(knots), -1, 3)
         standing = self._schedule.stance(np.array([t]))[0]
-        self._lift[standing] = (now - want[0])[standing]
+        # Along the ground only: a foot that is late to land goes on down.
+        self._lift[standing, :2] = (now - want[0])[standing, :2]
         height = max(float(x_ref[5] - want[0, :, 2].min()), 0.05)
         land = (x - x_ref)[3:6] + np.sqrt(height / self.model.g) * (x - x_ref)[9:12]
         land[2] = 0.0
