@@ -28,10 +28,13 @@ from slomo.track.schedule import Schedule
 Array = np.ndarray
 
 _SOLVED = ("Solved", "AlmostSolved")
+# Times the MPC's time step: ten of them are a cycle of a gait, as in the paper. It cannot change when feet land and so
+# has to see it coming; in half of that a Go1 falls on the cat's walk.
+STRETCH = 2.0
 
 
 class ConvexMpc:
-    """A planner like `mpc.Mpc`, with its horizon, time step and weights of body and forces.
+    """A planner like `mpc.Mpc`, with its number of steps and its weights of body and forces, and longer steps.
 
     Args: as of `mpc.Mpc`.
     """
@@ -68,7 +71,7 @@ class ConvexMpc:
         if self._plan is not None and not (np.all(np.isfinite(q)) and np.all(np.isfinite(v))):
             return self._keep(start)
         c, C, r = self.config, self.model.C, self.reference
-        H, h = c.horizon, c.dt
+        H, h = c.horizon, STRETCH * c.dt
         knots = t + h * np.arange(H + 1)
         q_ref, v_ref, u_ref = np.empty((H + 1, 7 + 3 * C)), np.empty((H + 1, 6 + 3 * C)), np.empty((H, 3 * C))
         sample_all(r.t, r.q, r.v, r.u, knots, q_ref, v_ref, u_ref)
@@ -153,10 +156,11 @@ class ConvexMpc:
         if not len(used):
             return forces.reshape(*stance.shape, 3)
         S = S[:, used]
-        h = np.full(H, c.dt)
+        dt = STRETCH * c.dt
+        h = np.full(H, dt)
         h[-1] += c.terminal
         w = (h[:, None] * self._w_x).ravel()
-        effort = c.dt * c.effort / (self._mass.sum() * self.model.g) ** 2
+        effort = dt * c.effort / (self._mass.sum() * self.model.g) ** 2
         P = S.T @ (w[:, None] * S) + effort * np.eye(len(used))
         g = S.T @ (w * (free - x_ref.ravel())) - effort * forces_ref.ravel()[used]
         n, mu = len(used) // 3, c.mu
