@@ -163,7 +163,8 @@ class ConvexMpc:
         effort = dt * c.effort / (self._mass.sum() * self.model.g) ** 2
         P = S.T @ (w[:, None] * S) + effort * np.eye(len(used))
         g = S.T @ (w * (free - x_ref.ravel())) - effort * forces_ref.ravel()[used]
-        n, mu = len(used) // 3, c.mu
+        # Inside of the cone: one about it would allow 1.4 times the friction along its edges.
+        n, mu = len(used) // 3, c.mu / np.sqrt(2)
         pyramid = np.array([[1, 0, -mu], [-1, 0, -mu], [0, 1, -mu], [0, -1, -mu], [0, 0, -1.0], [0, 0, 1.0]])
         limit = np.zeros((n, 6))
         limit[:, 5] = np.tile(self.model.u_max[:, 2], (H, 1))[stance]
