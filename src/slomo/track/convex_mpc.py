@@ -1,7 +1,8 @@
 """Convex model-predictive control with the reference's contact schedule: a baseline.
 
 Di Carlo et al., "Dynamic locomotion in the MIT Cheetah 3 through convex model-predictive control" (IROS 2018): one
-rigid body, small roll and pitch, lever arms and heading of the reference, so that forces enter linearly,
+rigid body, small roll and pitch, heading of the reference, lever arms of feet where they will be from a body that moves
+as the reference does, so that forces enter linearly,
 
     Theta' = R_z^T w,   p' = v,   I w' = sum_c r_c x f_c,   m v' = sum_c f_c + m g     (their eq. 17),
 
@@ -27,10 +28,13 @@ from slomo.track.schedule import Schedule
 Array = np.ndarray
 
 _SOLVED = ("Solved", "AlmostSolved")
+# Times the MPC's time step: ten of them are a cycle of a gait, as in the paper. It cannot change when feet land and so
+# has to see it coming; in half of that a Go1 falls on the cat's walk.
+STRETCH = 2.0
 
 
 class ConvexMpc:
-    """A planner like `mpc.Mpc`, with its horizon, time step and weights of body and forces.
+    """A planner like `mpc.Mpc`, with its number of steps and its weights of body and forces, and longer steps.
 
     Args: as of `mpc.Mpc`.
     """
@@ -67,7 +71,7 @@ class ConvexMpc:
         if self._plan is not None and not (np.all(np.isfinite(q)) and np.all(np.isfinite(v))):
             return self._keep(start)
         c, C, r = self.config, self.model.C, self.reference
-        H, h = c.horizon, c.dt
+        H, h = c.horizon, STRETCH * c.dt
         knots = t + h * np.arange(H + 1)
         q_ref, v_ref, u_ref = np.empty((H + 1, 7 + 3 * C)), np.empty((H + 1, 6 + 3 * C)), np.empty((H, 3 * C))
         sample_all(r.t, r.q, r.v, r.u, knots, q_ref, v_ref, u_ref)
@@ -77,8 +81,9 @@ class ConvexMpc:
 
         x_ref, x0 = self._body_states(q_ref, v_ref, q_ref[0, 3:7]), self._body_states(q[None], v[None], q_ref[0, 3:7])
         feet = self._feet(t, knots, q, x0[0], x_ref[0], q_ref)
-        points = np.concatenate([q[None, 7:], q_ref[1:, 7:]]).reshape(H + 1, C, 3)
-        arms = points[:-1] - np.concatenate([x0[:, 3:6], x_ref[1:-1, 3:6]])[:, None]
+        # From where the body is, not from the reference: a body that has come off its place over standing feet has
+        # other arms, and forces that balance on the reference's tip it over.
+        arms = (feet - (x_ref + x0 - x_ref[0])[:, None, 3:6])[:-1]
         problem = _condensed(x0[0], x_ref[:, 2], arms, self._mass.sum(), self._inertia, self.model.g, h)
         forces = self._solve(problem, x_ref[1:], forces_ref, stance)
         if forces is None:
@@ -93,7 +98,8 @@ class ConvexMpc:
         q_plan[:, 3:7], v_plan[:, 3:6] = R.as_quat(), R.inv().apply(x[:, 6:9])
         q_plan[:, 7:] = feet.reshape(H + 1, -1)
         v_plan[1:, 6:] = np.diff(q_plan[:, 7:], axis=0) / h
-        q_plan[0], v_plan[0] = q, v
+        # Not the measured feet: made anew at every tick, the way from there would never leave them.
+        q_plan[0, :7], v_plan[0] = q[:7], v
         # What a foot does to the body: the ground's force less its own weight, or in the air what swings it.
         gravity = self.model.foot_mass[:, None] * [0.0, 0.0, -self.model.g]
         swing = np.where(stance[..., None], 0.0, u_ref.reshape(H, C, 3) - gravity)
@@ -132,7 +138,8 @@ class ConvexMpc:
         """
         now, want = q[7:].reshape(-1, 3), q_ref[:, 7:].reshape(len(knots), -1, 3)
         standing = self._schedule.stance(np.array([t]))[0]
-        self._lift[standing] = (now - want[0])[standing]
+        # Along the ground only: a foot that is late to land goes on down.
+        self._lift[standing, :2] = (now - want[0])[standing, :2]
         height = max(float(x_ref[5] - want[0, :, 2].min()), 0.05)
         land = (x - x_ref)[3:6] + np.sqrt(height / self.model.g) * (x - x_ref)[9:12]
         land[2] = 0.0
@@ -149,13 +156,15 @@ class ConvexMpc:
         if not len(used):
             return forces.reshape(*stance.shape, 3)
         S = S[:, used]
-        h = np.full(H, c.dt)
+        dt = STRETCH * c.dt
+        h = np.full(H, dt)
         h[-1] += c.terminal
         w = (h[:, None] * self._w_x).ravel()
-        effort = c.dt * c.effort / (self._mass.sum() * self.model.g) ** 2
+        effort = dt * c.effort / (self._mass.sum() * self.model.g) ** 2
         P = S.T @ (w[:, None] * S) + effort * np.eye(len(used))
         g = S.T @ (w * (free - x_ref.ravel())) - effort * forces_ref.ravel()[used]
-        n, mu = len(used) // 3, c.mu
+        # Inside of the cone: one about it would allow 1.4 times the friction along its edges.
+        n, mu = len(used) // 3, c.mu / np.sqrt(2)
         pyramid = np.array([[1, 0, -mu], [-1, 0, -mu], [0, 1, -mu], [0, -1, -mu], [0, 0, -1.0], [0, 0, 1.0]])
         limit = np.zeros((n, 6))
         limit[:, 5] = np.tile(self.model.u_max[:, 2], (H, 1))[stance]
