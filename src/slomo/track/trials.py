@@ -30,7 +30,7 @@ from slomo.track.stage import check_robot
 from slomo.track.trial import ROWS, Result, run_trial
 from slomo.track.trials_report import as_text, plot, summary
 
-VERSION = 3
+VERSION = 4
 
 
 @dataclass(frozen=True)
