@@ -123,9 +123,9 @@ def _key_frames(t: np.ndarray, every: int, most: int = _MOST_KEYS) -> tuple[np.n
 def _structure(
     frames, masks, t, tracks: Tracks, turning_R: np.ndarray, s: CameraSettings, report: dict[str, Any], progress
 ) -> sfm.Structure | None:
-    """Structure from motion of the key frames: from the path that the tracks give, and where that does not hold, from a
-    pair of frames, once more with twice as many of them where they were thinned; None when too few are placed. The
-    report says how many, and which it is. A structure is kept in a checkpoint."""
+    """Structure from motion of the key frames: from the path that the tracks give, and where that is in doubt, from a
+    pair of frames too, once more with twice as many of them where they were thinned: what explains the tracks better.
+    None when too few are placed. The report says how many, and which it is. A structure is kept in a checkpoint."""
     if (saved := progress.load()) is not None:
         structure = sfm.Structure.of(saved)
         report |= {"key_frames": int(saved["key_frames"]), "key_frames_registered": len(structure.frames)}
@@ -155,23 +155,28 @@ def _structure(
         progress.save(structure.arrays() | more)
         return structure
 
-    epipolar = Epipolar(tracks, keys, gaps, center, s.seed)
-    if epipolar.least_shared >= _LEAST_CORNERS:
+    placed, explained = None, np.inf
+    if (epipolar := Epipolar(tracks, keys, gaps, center, s.seed)).least_shared >= _LEAST_CORNERS:
         path = track_path(epipolar, tracks, keys, center, s.focal, s.seed, turning_R)
-        structure = solve(keys, path.T_world_cam) if path.in_front > _IN_FRONT else None
-        if structure and epipolar.cost(structure.T_world_cam, structure.focal) < _AGREES * path.cost:
-            return done(structure, keys, "tracks")
+        if path.in_front > _IN_FRONT and (structure := solve(keys, path.T_world_cam)):
+            explained = epipolar.cost(structure.T_world_cam, structure.focal)
+            placed = structure if explained < _AGREES * path.cost else None
+        if placed and path.agreed:
+            return done(placed, keys, "tracks")
     tried = 0
     for most in (_MOST_KEYS, 2 * _MOST_KEYS):
         more, _ = _key_frames(t, s.key_every, most)
         if len(more) == tried:
             break
         tried = len(more)
-        structure = solve(more)
-        report |= {"key_frames": tried, "key_frames_registered": 0 if structure is None else len(structure.frames)}
-        if structure is not None and len(structure.frames) >= sfm.ENOUGH * tried:
-            return done(structure, more, "pair")
-    return None
+        mapped = solve(more)
+        report |= {"key_frames": tried, "key_frames_registered": 0 if mapped is None else len(mapped.frames)}
+        if mapped is not None and len(mapped.frames) >= sfm.ENOUGH * tried:
+            compared = Epipolar(tracks, mapped.frames, gaps, center, s.seed)
+            if explained < compared.cost(mapped.T_world_cam, mapped.focal) and placed:
+                break
+            return done(mapped, more, "pair")
+    return done(placed, keys, "tracks") if placed else None
 
 
 def _waiting(progress, usual: float, took: float) -> None:

@@ -269,9 +269,13 @@ def _placed(root: Path, database: Path, images: Path, job: dict[str, Any]):
         adjustment = pycolmap.BundleAdjustmentOptions()
         adjustment.refine_focal_length = job["refine_focal"]
         adjustment.print_summary = False
+        adjustment.ceres.solver_options.num_threads = job["threads"]
+        adjustment.ceres.solver_options.function_tolerance = 1e-6
         for _ in range(_ROUNDS):
             model = pycolmap.triangulate_points(model, database, images, root, options=mapping)
             pycolmap.bundle_adjustment(model, adjustment)
+            # Points that it has sent to infinity or behind a camera.
+            pycolmap.ObservationManager(model).filter_all_points3D(mapping.mapper.filter_max_reproj_error, angle)
         model.normalize()
         best, best_angle = model, angle
         if model.num_points3D() >= _ENOUGH_POINTS * len(found):

@@ -7,7 +7,7 @@ Here two steps take turns, each over all frames: positions and points of known r
 obey the epipolar constraint of every pair of frames (Sampson distance; Hartley and Zisserman, 2nd ed., eq. 11.9).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -34,12 +34,14 @@ class TrackedPath:
         focal: px, as given.
         cost: of `Epipolar.cost`.
         in_front: part of the sightings whose point lies before the camera.
+        agreed: whether another start led to the same.
     """
 
     T_world_cam: np.ndarray
     focal: float
     cost: float
     in_front: float
+    agreed: bool = False
 
 
 class Epipolar:
@@ -128,7 +130,7 @@ def track_path(
         found.append(_from(epipolar, sightings, Rotation.from_rotvec(share * turns).as_matrix(), focal))
         found.sort(key=lambda path: path.cost)
         if len(found) > 1 and _SETTLED * found[1].cost < found[0].cost:
-            break
+            return replace(found[0], agreed=True)
     return found[0]
 
 
