@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+import safetensors.numpy
 from scipy.spatial.transform import Rotation
 
 from slomo.reconstruct import certainty, resection, sfm
@@ -162,7 +163,7 @@ class Saved(Silent):
         return self.state
 
     def save(self, state) -> None:
-        self.state = {k: np.array(v) for k, v in state.items()}
+        self.state = safetensors.numpy.load(safetensors.numpy.save(state))
         raise Stop
 
 

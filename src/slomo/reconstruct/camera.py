@@ -129,7 +129,7 @@ def _structure(
     if (saved := progress.load()) is not None:
         structure = sfm.Structure.of(saved)
         report |= {"key_frames": int(saved["key_frames"]), "key_frames_registered": len(structure.frames)}
-        report["structure_start"] = str(saved["structure_start"])
+        report["structure_start"] = "tracks" if saved["from_tracks"] else "pair"
         return structure
     h, w = frames.shape[1:3]
     center = np.array([(w - 1) / 2, (h - 1) / 2])
@@ -151,7 +151,7 @@ def _structure(
 
     def done(structure: sfm.Structure, keys: np.ndarray, start: str) -> sfm.Structure:
         report.update(key_frames=len(keys), key_frames_registered=len(structure.frames), structure_start=start)
-        more = {"key_frames": np.array(len(keys)), "structure_start": np.array(start)}
+        more = {"key_frames": np.array(len(keys)), "from_tracks": np.array(start == "tracks")}
         progress.save(structure.arrays() | more)
         return structure
 
