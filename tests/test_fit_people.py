@@ -20,9 +20,11 @@ CENTRE = np.array([0.0, -2.2, 1.0])
 TOWARDS_CAMERA = -np.pi / 2
 
 
-def _problem(yaw: np.ndarray, q: np.ndarray) -> tuple[Problem, hypotheses.RootGuess]:
-    """A person one unit high at the origin with headings yaw (T,) and joint angles q (T, B, 3), seen along y."""
-    kin = Kinematics(load_skeleton("human"))
+def problem_of(
+    yaw: np.ndarray, q: np.ndarray, *, skeleton: str = "human", centre: np.ndarray = CENTRE
+) -> tuple[Problem, hypotheses.RootGuess]:
+    """A body one unit long at the origin with headings yaw (T,) and joint angles q (T, B, 3), seen along y."""
+    kin = Kinematics(load_skeleton(skeleton))
     f = lambda x: torch.as_tensor(x, dtype=torch.float32)  # noqa: E731
     root = hypotheses.RootGuess(np.zeros((T, 2)), 1.0, np.zeros(T), 0.0, np.zeros(T))
     guess = hypotheses.placed(kin, root, yaw[None])
@@ -32,9 +34,9 @@ def _problem(yaw: np.ndarray, q: np.ndarray) -> tuple[Problem, hypotheses.RootGu
     body = kin.pose(kin.shape_variables(1), guess.position, R, f(q)[None])
     M = np.eye(4)
     M[:3, :3] = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
-    M[:3, 3] = CENTRE
-    Rc, centre = f(M[:3, :3].T).expand(1, T, 3, 3), f(CENTRE).expand(1, T, 3)
-    a, b = (silhouette.to_camera(Rc, centre, x) for x in (body.a, body.b))
+    M[:3, 3] = centre
+    Rc, c = f(M[:3, :3].T).expand(1, T, 3, 3), f(centre).expand(1, T, 3)
+    a, b = (silhouette.to_camera(Rc, c, x) for x in (body.a, body.b))
     v, u = torch.meshgrid(torch.arange(float(H)), torch.arange(float(W)), indexing="ij")
     out = silhouette.outline(K, a, b, body.radii)
     sd, _ = silhouette.distances(out, u.reshape(1, -1).expand(T, -1), v.reshape(1, -1).expand(T, -1))
@@ -44,7 +46,7 @@ def _problem(yaw: np.ndarray, q: np.ndarray) -> tuple[Problem, hypotheses.RootGu
     camera = dict(K=np.array([[K.fx, 0, K.cx], [0, K.fy, K.cy], [0, 0, 1]]), T_world_cam=np.tile(M, (T, 1, 1)))
     obs = observe(np.arange(T) / FPS, masks, flow, camera, fps=8, subject_px=42)
     path = Trajectory(obs.t, kin.B, joint_hz=2, root_hz=2, width=8)
-    return Problem(obs, kin, path, {}, 0.01), root
+    return Problem(obs, kin, path, {"mask": 1.0, "keypoints": 0.5}, 0.01), root
 
 
 def _track(problem: Problem, root: hypotheses.RootGuess, **options) -> pose_track.Track:
@@ -67,7 +69,7 @@ def raising() -> tuple[Problem, hypotheses.RootGuess]:
     both = postures[names.index("left_arm hand_up, right_arm hand_up")].numpy()
     q = np.zeros((T, kin.B, 3))
     q[8:16] = both
-    return _problem(np.full(T, TOWARDS_CAMERA), q)
+    return problem_of(np.full(T, TOWARDS_CAMERA), q)
 
 
 def test_raised_hands_are_found_when_they_are_raised(raising):
@@ -98,7 +100,7 @@ def test_the_view_decides_between_front_and_back(raising, azimuth: float):
 def test_a_turn_to_the_side_is_followed():
     yaw = np.interp(np.arange(T), [8, 16], [TOWARDS_CAMERA, 0.0])
     kin = Kinematics(load_skeleton("human"))
-    track = _track(*_problem(yaw, np.zeros((T, kin.B, 3))))
+    track = _track(*problem_of(yaw, np.zeros((T, kin.B, 3))))
     assert _away(track.yaw, yaw).mean() < 35
 
 

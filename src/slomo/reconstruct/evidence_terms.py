@@ -67,18 +67,23 @@ def view(e: Evidence, s: State) -> Tensor:
 
 
 def keypoints(e: Evidence, s: State) -> Tensor:
-    """Nodes of the skeleton against their 2-D key points, in tenths of the subject's size (Cauchy's robust error).
+    """Nodes of the skeleton against their 2-D key points, in tenths of the subject's size (Cauchy's robust error)."""
+    return keypoints_by_frame(e, s).mean(1)
+
+
+def keypoints_by_frame(e: Evidence, s: State) -> Tensor:
+    """(H, F) the same of every fit frame.
 
     Left and right of a pair are a mixture of the two ways round: a frame that has them wrong costs the right pose no
     more than the logarithm of the odds, and many frames that agree decide.
     """
     X = silhouette.to_camera(s.R_cam, s.centre, s.body.nodes[:, :, e.node])
-    total = _distance(e, s, X[:, :, e.alone], e.uv[:, e.alone], e.confidence[:, e.alone]).sum((1, 2))
+    total = _distance(e, s, X[:, :, e.alone], e.uv[:, e.alone], e.confidence[:, e.alone]).sum(2)
     (i, j), uv, sure = e.pairs, e.uv, e.confidence
     own = _distance(e, s, X[:, :, i], uv[:, i], sure[:, i]) + _distance(e, s, X[:, :, j], uv[:, j], sure[:, j])
     other = _distance(e, s, X[:, :, i], uv[:, j], sure[:, j]) + _distance(e, s, X[:, :, j], uv[:, i], sure[:, i])
     either = -torch.logaddexp(e.pair_side.log() - own, (1 - e.pair_side).log() - other)
-    return (total + either.sum((1, 2))) / (X.shape[1] * len(s.kin.link))
+    return (total + either.sum(2)) / len(s.kin.link)
 
 
 def surface(e: Evidence, s: State) -> Tensor:

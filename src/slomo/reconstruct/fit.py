@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from slomo.reconstruct import hypotheses, pose_track
+from slomo.reconstruct import hypotheses, limb_track, pose_track
 from slomo.reconstruct.hypotheses import GaitHypothesis, RootGuess
 from slomo.reconstruct.problem import Problem, Schedule, Variables, optimise
 from slomo.reconstruct.run import Run, checkpoint, join, restore
@@ -265,30 +265,32 @@ def _diverse(entries: list, count: int) -> list:
 
 def _to_rivals(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
     """The two best go on; the best of another gait than the best one's, because a motion without a gait falls faster
-    at first and less far; and the best one with its left and right legs exchanged, because silhouettes hardly tell the
-    two apart and none of the others need be its opposite."""
+    at first and less far; the best one with its left and right legs exchanged, because silhouettes hardly tell the
+    two apart and none of the others need be its opposite; and the best one with limbs that are elsewhere for a while,
+    where they would be seen better there."""
     order = losses.argsort().tolist()
     other = [k for k in order if run.labels[k]["gait"] != run.labels[order[0]]["gait"]]
     which = torch.tensor(list(dict.fromkeys(order[:2] + other[:1])))
     best = which[:1]
     x, guess = _pick(run.x, which), run.guess.pick(which)
-    opposite = exchanged(problem, _pick(run.x, best), run.guess.pick(best))
-    x = {k: torch.cat([v, opposite[0][k]]) for k, v in x.items()}
+    more = {"exchanged": exchanged(problem, _pick(run.x, best), run.guess.pick(best))}
+    if problem.kin.skeleton.kind == "quadruped":
+        found = limb_track.by_limb(problem, _pick(run.x, best), run.guess.pick(best))
+        if found is not None:
+            more["on their own"] = found
+    x = {k: torch.cat([v, *(other[k] for other, _ in more.values())]) for k, v in x.items()}
     labels = [run.labels[int(k)] for k in which]
-    return Run(2, x, join([guess, opposite[1]]), [*labels, labels[0] | {"legs": "exchanged"}], run.log)
+    labels += [labels[0] | {"legs": name} for name in more]
+    return Run(2, x, join([guess, *(g for _, g in more.values())]), labels, run.log)
 
 
 def exchanged(problem: Problem, x: Variables, guess: Guess) -> tuple[Variables, Guess]:
     """The same motion with the joint angles of left and right legs exchanged, as a guess with no corrections to it."""
-    kin, T = problem.kin, len(problem.obs.t)
-    with torch.no_grad():
-        _, _, q = problem.path(x, guess, x["shape.log_length"].exp(), torch.arange(T))
+    x, guess = hypotheses.as_guess(problem, x, guess)
+    kin, q = problem.kin, guess.q.clone()
     legs = torch.tensor(hypotheses.leg_links(kin.skeleton))
-    mirrored = q.clone()
-    mirrored[:, :, legs] = q[:, :, kin.mirror[legs]] * torch.tensor([-1.0, 1.0, -1.0])
-    last = max(k for k in x if k.startswith("Q.w")).removeprefix("Q.w")
-    x = x | {k: torch.zeros_like(x[k]) for k in (f"Q.w{last}", f"Q.b{last}")}
-    return x, replace(guess, q=mirrored, stance=torch.full_like(guess.stance, -1.0))
+    q[:, :, legs] = guess.q[:, :, kin.mirror[legs]] * torch.tensor([-1.0, 1.0, -1.0])
+    return x, replace(guess, q=q)
 
 
 def _to_final(problem: Problem, run: Run, losses: Tensor, *_) -> Run:

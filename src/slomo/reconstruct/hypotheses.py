@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -104,6 +104,19 @@ def posture_angles(kin: Kinematics) -> tuple[Tensor, list[str]]:
         angles.append(q)
         names.append(", ".join(p.name for p in combination if p) or "rest")
     return torch.stack(angles), names
+
+
+def as_guess(problem, x, guess: Guess) -> tuple[dict[str, Tensor], Guess]:
+    """The same motion as a guess with no corrections of the joint angles to it, and without hypothetical contacts.
+
+    Args:
+        problem, x, guess: a `Problem`, its variables and guess.
+    """
+    with torch.no_grad():
+        _, _, q = problem.path(x, guess, x["shape.log_length"].exp(), torch.arange(len(problem.obs.t)))
+    last = max(k for k in x if k.startswith("Q.w")).removeprefix("Q.w")
+    x = x | {k: torch.zeros_like(x[k]) for k in (f"Q.w{last}", f"Q.b{last}")}
+    return x, replace(guess, q=q, stance=torch.full_like(guess.stance, -1.0))
 
 
 def leg_links(skeleton: Skeleton) -> list[int]:

@@ -103,7 +103,7 @@ def tracks(
         turned = np.unwrap(np.asarray(turns)[way])[:, None]
         q = postures.numpy()[posture].reshape(len(at), -1)
         width = 2 * every * int(obs.at[1] - obs.at[0]) + 1
-        turned, q = (_smooth(_fill(obs.t.numpy(), at, y), width) for y in (turned, q))
+        turned, q = (smooth(fill(obs.t.numpy(), at, y), width) for y in (turned, q))
         cheapest = float(table[np.arange(len(path)), path].mean())
         out.append(Track(guess.yaw[0].numpy() + turned[:, 0], q.reshape(-1, *postures.shape[1:]), cheapest,
                          np.bincount(posture, minlength=N)))  # fmt: skip
@@ -129,12 +129,12 @@ def _steps(headings: int, postures: Tensor) -> Array:
     return (TURN * apart[:, None, :, None] + change[None, :, None, :]).reshape(headings * len(p), -1)
 
 
-def _fill(t: Array, at: Array, y: Array) -> Array:
+def fill(t: Array, at: Array, y: Array) -> Array:
     """(T, D) values y (S, D) at frames `at`, linear between them."""
     return np.stack([np.interp(t, t[at], c) for c in y.T], 1)
 
 
-def _smooth(x: Array, width: int) -> Array:
+def smooth(x: Array, width: int) -> Array:
     """(T, D) moving average over an odd number of frames."""
     half = width // 2
     padded = np.pad(x, ((half, half), (0, 0)), "edge")
