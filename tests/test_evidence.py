@@ -11,8 +11,7 @@ from slomo.pinhole import Intrinsics
 from slomo.prior.labels import BINS, labels
 from slomo.reconstruct import evidence_terms, hypotheses, losses, silhouette
 from slomo.reconstruct.evidence import Evidence, gather, nearest
-from slomo.reconstruct.fit import exchanged
-from slomo.reconstruct.hypotheses import GaitHypothesis
+from slomo.reconstruct.hypotheses import GaitHypothesis, exchanged
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.observations import Observations, observe
 from slomo.reconstruct.problem import Draw, Problem, Schedule, optimise

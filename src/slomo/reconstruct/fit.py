@@ -273,7 +273,7 @@ def _to_rivals(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
     which = torch.tensor(list(dict.fromkeys(order[:2] + other[:1])))
     best = which[:1]
     x, guess = _pick(run.x, which), run.guess.pick(which)
-    more = {"exchanged": exchanged(problem, _pick(run.x, best), run.guess.pick(best))}
+    more = {"exchanged": hypotheses.exchanged(problem, _pick(run.x, best), run.guess.pick(best))}
     if problem.kin.skeleton.kind == "quadruped":
         found = limb_track.by_limb(problem, _pick(run.x, best), run.guess.pick(best))
         if found is not None:
@@ -282,15 +282,6 @@ def _to_rivals(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
     labels = [run.labels[int(k)] for k in which]
     labels += [labels[0] | {"legs": name} for name in more]
     return Run(2, x, join([guess, *(g for _, g in more.values())]), labels, run.log)
-
-
-def exchanged(problem: Problem, x: Variables, guess: Guess) -> tuple[Variables, Guess]:
-    """The same motion with the joint angles of left and right legs exchanged, as a guess with no corrections to it."""
-    x, guess = hypotheses.as_guess(problem, x, guess)
-    kin, q = problem.kin, guess.q.clone()
-    legs = torch.tensor(hypotheses.leg_links(kin.skeleton))
-    q[:, :, legs] = guess.q[:, :, kin.mirror[legs]] * torch.tensor([-1.0, 1.0, -1.0])
-    return x, replace(guess, q=q)
 
 
 def _to_final(problem: Problem, run: Run, losses: Tensor, *_) -> Run:

@@ -119,6 +119,15 @@ def as_guess(problem, x, guess: Guess) -> tuple[dict[str, Tensor], Guess]:
     return x, replace(guess, q=q, stance=torch.full_like(guess.stance, -1.0))
 
 
+def exchanged(problem, x, guess: Guess) -> tuple[dict[str, Tensor], Guess]:
+    """The same motion with the joint angles of left and right legs exchanged, as a guess with no corrections to it."""
+    x, guess = as_guess(problem, x, guess)
+    kin, q = problem.kin, guess.q.clone()
+    legs = torch.tensor(leg_links(kin.skeleton))
+    q[:, :, legs] = guess.q[:, :, kin.mirror[legs]] * torch.tensor([-1.0, 1.0, -1.0])
+    return x, replace(guess, q=q)
+
+
 def leg_links(skeleton: Skeleton) -> list[int]:
     """The links of all legs: from the joint that swings one to its contact."""
     out = set()
