@@ -91,7 +91,7 @@ def test_a_truncated_clip(slomo, tmp_path):
     (tmp_path / "half.mp4").write_bytes(data[: len(data) // 2])
     # An unknown segmenter ends it right after decoding: only the frames are of interest here.
     said = slomo(tmp_path / "a", "reconstruct", tmp_path / "half.mp4", "--segmenter", "nonsense", code=2)
-    assert "unknown segmenter 'nonsense' (valid: auto, u2netp, motion, user)" in said
+    assert "unknown segmenter 'nonsense' (valid: auto, u2netp, still, motion, user)" in said
     (video,) = (tmp_path / "a").glob(".slomo/store/decode/*/video.json")
     info = json.loads(video.read_text())
     assert info["frames_total"] >= 8
