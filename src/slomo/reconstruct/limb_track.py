@@ -97,7 +97,7 @@ def _chain(skeleton: Skeleton, limb: Limb) -> list[int]:
 
 def _postures(problem: Problem, chain: list[int]) -> Array:
     """(N, J) rad, pitch of the chain's joints in every combination; those beyond `PLACES` in the middle."""
-    lower, upper = problem.kin.lower[:, 1].numpy(), problem.kin.upper[:, 1].numpy()
+    lower, upper = (x[:, 1].numpy().clip(-math.pi, math.pi) for x in (problem.kin.lower, problem.kin.upper))
     places = [PLACES[k] if k < len(PLACES) else (0.5,) for k in range(len(chain))]
     values = [lower[j] + np.array(p) * (upper[j] - lower[j]) for j, p in zip(chain, places, strict=True)]
     return np.array(list(itertools.product(*values)))
