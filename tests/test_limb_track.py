@@ -1,5 +1,7 @@
 """Limbs that are elsewhere for a while, from drawn silhouettes of the skeleton itself."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -69,7 +71,7 @@ def test_key_points_tell_which_paw_it_is(side):
         frame=np.arange(T), keypoint_names=np.array(points), keypoints=uv,
         keypoint_confidence=np.full(uv.shape[:2], 0.8), keypoint_side=np.full(4, 0.9),
     )  # fmt: skip
-    object.__setattr__(problem, "said", gather(arrays, problem.obs, problem.kin.skeleton))
+    problem = replace(problem, said=gather(arrays, problem.obs, problem.kin.skeleton))
     found = limb_track.by_limb(problem, x, guess)
     assert found is not None
     height = paws(problem, *found) - paws(problem, x, guess)

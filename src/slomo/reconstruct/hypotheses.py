@@ -12,8 +12,9 @@ from slomo.ground_path import ground_path
 from slomo.reconstruct.evidence import Evidence
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.observations import Observations
+from slomo.reconstruct.problem import Problem, Variables
 from slomo.reconstruct.trajectory import Guess
-from slomo.skeleton import Gait, Skeleton
+from slomo.skeleton import Gait, Limb, Skeleton
 
 Array = np.ndarray
 Tensor = torch.Tensor
@@ -106,12 +107,8 @@ def posture_angles(kin: Kinematics) -> tuple[Tensor, list[str]]:
     return torch.stack(angles), names
 
 
-def as_guess(problem, x, guess: Guess) -> tuple[dict[str, Tensor], Guess]:
-    """The same motion as a guess with no corrections of the joint angles to it, and without hypothetical contacts.
-
-    Args:
-        problem, x, guess: a `Problem`, its variables and guess.
-    """
+def as_guess(problem: Problem, x: Variables, guess: Guess) -> tuple[Variables, Guess]:
+    """The same motion as a guess with no corrections of the joint angles to it, and without hypothetical contacts."""
     with torch.no_grad():
         _, _, q = problem.path(x, guess, x["shape.log_length"].exp(), torch.arange(len(problem.obs.t)))
     last = max(k for k in x if k.startswith("Q.w")).removeprefix("Q.w")
@@ -119,7 +116,7 @@ def as_guess(problem, x, guess: Guess) -> tuple[dict[str, Tensor], Guess]:
     return x, replace(guess, q=q, stance=torch.full_like(guess.stance, -1.0))
 
 
-def exchanged(problem, x, guess: Guess) -> tuple[dict[str, Tensor], Guess]:
+def exchanged(problem: Problem, x: Variables, guess: Guess) -> tuple[Variables, Guess]:
     """The same motion with the joint angles of left and right legs exchanged, as a guess with no corrections to it."""
     x, guess = as_guess(problem, x, guess)
     kin, q = problem.kin, guess.q.clone()
@@ -128,15 +125,19 @@ def exchanged(problem, x, guess: Guess) -> tuple[dict[str, Tensor], Guess]:
     return x, replace(guess, q=q)
 
 
+def limb_links(skeleton: Skeleton, limb: Limb) -> list[int]:
+    """The limb's links, from the one that its swing joint moves outwards."""
+    out = []
+    node, trunk = int(skeleton.link[limb.contact]), int(skeleton.link[limb.swing])
+    while node != trunk and node > 0:
+        out.append(node)
+        node = int(skeleton.link[node])
+    return out[::-1]
+
+
 def leg_links(skeleton: Skeleton) -> list[int]:
-    """The links of all legs: from the joint that swings one to its contact."""
-    out = set()
-    for limb in skeleton.limbs:
-        node = int(skeleton.link[limb.contact])
-        while node != skeleton.link[limb.swing] and node > 0:
-            out.add(node)
-            node = int(skeleton.link[node])
-    return sorted(out)
+    """The links of all legs."""
+    return sorted({link for limb in skeleton.limbs for link in limb_links(skeleton, limb)})
 
 
 def stride_frequencies(obs: Observations, low: float, high: float) -> list[float]:

@@ -13,11 +13,10 @@ import numpy as np
 import torch
 
 from slomo.reconstruct import evidence_terms, losses
-from slomo.reconstruct.hypotheses import as_guess
+from slomo.reconstruct.hypotheses import as_guess, limb_links
 from slomo.reconstruct.pose_track import fill, smooth, viterbi
 from slomo.reconstruct.problem import Draw, Problem, Variables
 from slomo.reconstruct.trajectory import Guess
-from slomo.skeleton import Limb, Skeleton
 
 Array = np.ndarray
 Tensor = torch.Tensor
@@ -41,8 +40,8 @@ def by_limb(problem: Problem, x: Variables, guess: Guess) -> tuple[Variables, Gu
     width = 2 * every * int(obs.at[1] - obs.at[0]) + 1
     left, moved = list(problem.kin.skeleton.limbs), False
     while left:
-        # The one that gains most goes first: what it is seen by then, no other needs to cover.
-        found = [_path(problem, x, guess, _chain(problem.kin.skeleton, limb), seen) for limb in left]
+        # The one that gains most goes first: what it covers then, no other needs to.
+        found = [_path(problem, x, guess, limb_links(problem.kin.skeleton, limb), seen) for limb in left]
         best = max(range(len(left)), key=lambda n: found[n][0])
         gain, chain, angles = found[best]
         if gain <= 0:
@@ -83,16 +82,6 @@ def _path(
     angles[away, :, 1] = places[path[away] - 1]
     total = cost[np.arange(len(path)), path].sum() + step[path[:-1], path[1:]].sum()
     return float(cost[:, 0].sum() - total), chain, angles
-
-
-def _chain(skeleton: Skeleton, limb: Limb) -> list[int]:
-    """The limb's links, from the one that swings it outwards."""
-    out = []
-    node, trunk = int(skeleton.link[limb.contact]), int(skeleton.link[limb.swing])
-    while node != trunk and node > 0:
-        out.append(node)
-        node = int(skeleton.link[node])
-    return out[::-1]
 
 
 def _postures(problem: Problem, chain: list[int]) -> Array:

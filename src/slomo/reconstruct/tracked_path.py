@@ -31,14 +31,12 @@ class TrackedPath:
 
     Attributes:
         T_world_cam: (N, 4, 4) OpenCV convention; the first frame's camera is the world, the scale is arbitrary.
-        focal: px, as given.
         cost: of `Epipolar.cost`.
         in_front: part of the sightings whose point lies before the camera.
         agreed: whether another start led to the same.
     """
 
     T_world_cam: np.ndarray
-    focal: float
     cost: float
     in_front: float
     agreed: bool = False
@@ -104,6 +102,7 @@ class Epipolar:
         r = focal * n / d
         jacobian = focal * dn / d[:, None] - r[:, None] * dd / d[:, None]
         jacobian[:, 12] += r
+        # Frame by frame: turn and shift of i, turn and shift of j.
         order = [0, 1, 2, 6, 7, 8, 3, 4, 5, 9, 10, 11, 12]
         return r[:, None], jacobian[:, None, order]
 
@@ -117,9 +116,11 @@ def track_path(
     seed: int,
     turning: np.ndarray,
 ) -> TrackedPath:
-    """Cameras of the frames `keys` (N,) whose focal length is given.
+    """Cameras of the frames `keys` (N,).
 
     Args:
+        epipolar: correspondences of the tracks between these frames.
+        center: (2,) px, principal point.  focal: px, kept.  seed: of the draw of tracks where there are many.
         turning: (N, 3, 3) rotations of a camera that only turns and explains as much as it can. Which part of them is
             travel is unknown: the path is sought from none of them, all and half, until two agree.
     """
@@ -164,7 +165,7 @@ def _from(epipolar: Epipolar, sightings: "_Sightings", R: np.ndarray, focal: flo
     p, in_front = sightings.positions(R, _SETTLED_SMOOTH)
     T = np.tile(np.eye(4), (N, 1, 1))
     T[:, :3, :3], T[:, :3, 3] = R[0].T @ R, (p - p[0]) @ R[0]
-    return TrackedPath(T, focal, epipolar.cost(T, focal), in_front)
+    return TrackedPath(T, epipolar.cost(T, focal), in_front)
 
 
 class _Sightings:
