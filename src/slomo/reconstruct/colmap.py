@@ -16,6 +16,7 @@ import numpy as np
 import pycolmap
 
 from slomo.reconstruct.sfm import ENOUGH
+from slomo.threads import cores
 
 # Degrees between rays, of the first pair and of any point. COLMAP's usual ones give the better structure; a hand-held
 # clip that turns more than it travels has no points left at those.
@@ -53,7 +54,8 @@ def _main(folder: str) -> None:
         reader.camera_params = ",".join(map(str, [job["focal"], *job["center"]]))
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = job["features"]
-    extraction.num_threads, extraction.use_gpu = job["threads"], False
+    # Each picture is looked at by itself, so that what is found does not depend on the threads.
+    extraction.num_threads, extraction.use_gpu = cores(), False
     pycolmap.extract_features(
         database,
         images,

@@ -19,11 +19,10 @@ class ColourModel:
     @classmethod
     def learn(cls, lab: np.ndarray, subject: np.ndarray, surroundings: np.ndarray) -> "ColourModel":
         """From Lab pixels (P, 3) uint8 with their weights (P,) as subject and as surroundings."""
-        index = tuple((lab.astype(int) * _BINS // 256).T)
+        index = np.ravel_multi_index(tuple((lab.astype(int) * _BINS // 256).T), (_BINS,) * 3)
         density = []
         for weight in (subject, surroundings):
-            counts = np.zeros((_BINS,) * 3)
-            np.add.at(counts, index, weight)
+            counts = np.bincount(index, weight, _BINS**3).reshape((_BINS,) * 3)
             for axis in range(3):
                 counts = _blur(counts, axis)
             density.append(counts / max(counts.sum(), 1e-9) + 1e-6)

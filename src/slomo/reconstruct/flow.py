@@ -5,12 +5,12 @@ on a grid of half as many cells either way, which is the one that it is computed
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import cv2
 import numpy as np
 
 from slomo.prior.frames import spread
+from slomo.threads import in_order
 
 
 @dataclass(frozen=True)
@@ -44,18 +44,21 @@ class Flow:
 
 def dense_flow(frames: np.ndarray, progress=lambda fraction: None) -> Flow:
     """DIS flow (Kroeger et al., ECCV 2016; medium preset) of (T, H, W, 3) uint8 RGB frames, both ways."""
-    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    gray = (cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames)
     height, width = frames.shape[1:3]
     cells = ((width + 1) // 2, (height + 1) // 2)
     shape = (len(frames) - 1, cells[1], cells[0])
     forward, backward = np.empty((*shape, 2), np.float16), np.empty((*shape, 2), np.float16)
     consistent = np.empty(shape, bool)
-    for t, (a, b) in enumerate(pairwise(gray)):
+
+    def both_ways(t: int) -> None:
+        dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        a, b = (cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames[t : t + 2])
         there, back = dis.calc(a, b, None), dis.calc(b, a, None)  # type: ignore[call-overload]
         forward[t], backward[t] = (cv2.resize(f, cells, interpolation=cv2.INTER_AREA) for f in (there, back))
         home = _consistent(there, back).astype(np.float32)
         consistent[t] = cv2.resize(home, cells, interpolation=cv2.INTER_AREA) > 0.5
+
+    for t, _ in enumerate(in_order(both_ways, range(shape[0]))):
         progress((t + 1) / shape[0])
     return Flow(forward, backward, consistent, (width, height))
 

@@ -1,11 +1,14 @@
 """What a network takes in of the furniture around a subject is given back by its colours."""
 
+from functools import partial
+
 import cv2
 import numpy as np
 
 from slomo.reconstruct.colour import ColourModel, cut, learn_colours, to_lab
 from slomo.reconstruct.flow import Flow, inside, sample
 from slomo.reconstruct.segment import grown
+from slomo.threads import in_order
 
 _FOREIGN = 0.17  # part of a mask in patches of the surroundings' colours, from which on it is cut anew
 _COLOUR = -0.75  # mean log ratio of a patch that is of the surroundings
@@ -62,8 +65,8 @@ def give_back_patches(frames: np.ndarray, layers: dict[int, np.ndarray], flow: F
         if len(there) < 2:
             break
         model = learn_colours(frames, there, reach=2.0)
-        taken = {k: _patches(frames[k], k, bodies, model, flow) for k in there}
-        for k, gone in taken.items():
+        find = partial(_patches, frames, bodies=bodies, model=model, flow=flow)
+        for k, gone in list(zip(there, in_order(find, there), strict=True)):
             if gone.any():
                 changed.add(k)
                 bodies[k] &= ~gone
@@ -71,8 +74,11 @@ def give_back_patches(frames: np.ndarray, layers: dict[int, np.ndarray], flow: F
     return len(changed)
 
 
-def _patches(frame: np.ndarray, k: int, bodies: dict[int, np.ndarray], model: ColourModel, flow: Flow) -> np.ndarray:
+def _patches(
+    frames: np.ndarray, k: int, *, bodies: dict[int, np.ndarray], model: ColourModel, flow: Flow
+) -> np.ndarray:
     """(H, W) bool: the pieces of body k that are of the surroundings."""
+    frame = frames[k]
     body, lab = bodies[k], to_lab(frame)
     area, gone = float(body.sum()), np.zeros_like(body)
     colour = cv2.GaussianBlur(model(lab), (0, 0), 1.5)

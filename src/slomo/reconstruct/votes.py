@@ -9,6 +9,7 @@ import numpy as np
 from slomo.reconstruct.colour import to_lab
 from slomo.reconstruct.flow import Flow, sample
 from slomo.reconstruct.segment import Report
+from slomo.threads import cores, in_order
 
 REACH = 6  # frames either way from which a vote is taken at least
 _SPREAD = 3.0  # frames in which a vote loses its weight
@@ -36,18 +37,18 @@ def vote_over_time(
     def small(image: np.ndarray) -> np.ndarray:
         return cv2.resize(image.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
 
-    @lru_cache(2 * reach + 2)
+    @lru_cache(2 * reach + 2 + cores())
     def seen(k: int) -> tuple[np.ndarray | None, np.ndarray]:
         return small(layers[k]) if k in layers else None, small(to_lab(frames[k]))
 
-    @lru_cache(2 * reach + 2)
+    @lru_cache(2 * reach + 2 + cores())
     def step(k: int, ahead: bool) -> tuple[np.ndarray, np.ndarray]:
         """Cells from frame k to the next (or from k + 1 back), and where that leads home again."""
         there = (flow.forward if ahead else flow.backward)[k].astype(np.float32) * to_cells
         home = flow.consistent[k].astype(np.float32)
         return there, home if ahead else sample(home, there)
 
-    for t in range(T):
+    def voted(t: int) -> np.ndarray:
         own, shade = seen(t)
         total = np.zeros((height, width), np.float32) if own is None else own.copy()
         weight = np.full((height, width), 1e-9 if own is None else 1.0, np.float32)
@@ -69,5 +70,8 @@ def vote_over_time(
                 w = np.maximum(w, 1e-3 * np.exp(-n / _SPREAD)) if own is None else w
                 total += w * sample(said, offset)
                 weight += w
-        yield cv2.resize(total / weight, flow.size, interpolation=cv2.INTER_LINEAR)
+        return cv2.resize(total / weight, flow.size, interpolation=cv2.INTER_LINEAR)
+
+    for t, probability in enumerate(in_order(voted, range(T))):
+        yield probability
         progress((t + 1) / T)

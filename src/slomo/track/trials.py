@@ -24,6 +24,7 @@ from slomo.motion import Reference
 from slomo.robot import Robot
 from slomo.stage import Arrays, Artifact, Inputs, Progress, Silent
 from slomo.terrain import Terrain
+from slomo.threads import cores
 from slomo.track import config as track
 from slomo.track.planner import PLANNERS
 from slomo.track.stage import check_robot
@@ -121,15 +122,14 @@ def _simulate(setting: Setting, keys: list[Key]) -> Iterator[dict[Key, Result | 
 
     Yields at least twice a second, nothing where none has ended.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with _one_thread_each():
         pool = ProcessPoolExecutor(
-            min(cores, len(keys)), multiprocessing.get_context("spawn"), initializer=_begin, initargs=(setting,)
+            min(cores(), len(keys)), multiprocessing.get_context("spawn"), initializer=_begin, initargs=(setting,)
         )
         waiting, running = deque(keys), {}
         try:
             while waiting or running:
-                while waiting and len(running) < 2 * cores:
+                while waiting and len(running) < 2 * cores():
                     key = waiting.popleft()
                     running[pool.submit(_work, key)] = key
                 ended, _ = wait(running, timeout=0.5, return_when=FIRST_COMPLETED)
