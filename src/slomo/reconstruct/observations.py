@@ -15,6 +15,7 @@ from slomo.errors import InvalidData
 from slomo.ground_path import mask_box
 from slomo.pinhole import Intrinsics, ground_points
 from slomo.prior.frames import every, spread
+from slomo.reconstruct.steady import steadied
 
 Array = np.ndarray
 Tensor = torch.Tensor
@@ -31,7 +32,7 @@ class Observations:
     Attributes:
         t: (T,) s of all frames; at: (F,) indices of the fit frames; dt: (F-1,) s between them.
         K: intrinsics of the working resolution; scale: its pixels per decoded pixel.
-        T_world_cam: (T, 4, 4) as given.
+        T_world_cam: (T, 4, 4) as given, but for its tremble.
         mask: (F, n) bool; edge: (F, 1, h, w) px, signed distance to the mask's edge, positive outside.
         draw_in, draw_out: (F, n) cumulative probabilities for drawing mask and background pixels.
         flow: (F-1, n, 2) px; flow_ok: (F-1, n) bool.
@@ -105,7 +106,12 @@ def observe(
     for i, (first, last) in enumerate(itertools.pairwise(at.tolist())):
         total, sure = _chain(flow, first, last, (width, height))
         fl[i], ok[i] = smaller(total) * scale, smaller(sure) > 0.7
-    T_world_cam = np.asarray(camera["T_world_cam"], float)
+    T_world_cam = steadied(
+        np.asarray(camera["T_world_cam"], float),
+        Intrinsics(K0[0, 0], K0[1, 1], K0[0, 2], K0[1, 2], width, height),
+        flow["flow"],
+        _background(masks, flow),
+    )
     static = _static(K, T_world_cam[at], mask, fl, ok)
     distance = lambda m: cv2.distanceTransform(m.astype(np.uint8), cv2.DIST_L2, 3)  # noqa: E731
     inside = np.stack([distance(m) for m in mask])
@@ -125,6 +131,16 @@ def observe(
         quality=f(masks["quality"][at]) * f(~empty), box=box, empty=empty,
         flow_size=float(np.quantile(size, 0.5)) if len(size) else 1.0,
     )  # fmt: skip
+
+
+def _background(masks: Mapping[str, Array], flow: Mapping[str, Array]) -> Array:
+    """(T-1, h, w) bool: cells of the flow's grid that hold no subject and whose flow leads back."""
+    rows, columns = flow["flow"].shape[1:3]
+    there = np.unpackbits(flow["consistent"], axis=-1)[:, :, :columns].astype(bool)
+    for k in range(len(there)):
+        mask = cv2.dilate(unpack(masks["packed"][k], masks["shape"]).astype(np.uint8), np.ones((9, 9), np.uint8))
+        there[k] &= cv2.resize(mask.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA) == 0
+    return there
 
 
 def _beside(mask: Array, outside: Array) -> Array:
