@@ -94,6 +94,25 @@ def test_distance_gradient_against_finite_differences():
     assert torch.autograd.gradcheck(sd, args[:5], eps=1e-5, atol=1e-4)
 
 
+def test_minima_and_their_gradients():
+    """The smooth minimum is the logarithm of a sum of exponentials, and the gradients are those of what it says."""
+    generator = torch.Generator().manual_seed(4)
+    sd = 200 * torch.rand(1, 2, 3, 5, generator=generator, dtype=torch.float64)
+    near = (sd.amin(-1, keepdim=True) + 3 * torch.rand(sd.shape, generator=generator, dtype=torch.float64)).clone()
+    for x in (sd, near):
+        soft, least, which = silhouette.nearest(x, 0.7)
+        torch.testing.assert_close(soft, -0.7 * torch.logsumexp(x / -0.7, -1))
+        torch.testing.assert_close(least, x.amin(-1))
+        assert torch.equal(which, x.argmin(-1))
+        assert torch.autograd.gradcheck(
+            lambda y: silhouette.nearest(y, 0.7)[:2], [x.clone().requires_grad_()], atol=1e-5
+        )
+    of = torch.randint(5, (1, 2, 3, 2, 3), generator=generator)
+    expected = sd.gather(-1, of.flatten(-2)).unflatten(-1, (2, 3)).amin(-1)
+    torch.testing.assert_close(silhouette.least_of(sd, of), expected)
+    assert torch.autograd.gradcheck(lambda y: silhouette.least_of(y, of), [sd.requires_grad_()], atol=1e-5)
+
+
 def test_distance_of_a_tapered_capsule():
     one = lambda x: torch.tensor([[[float(x)]]])  # noqa: E731
     o = Outline(one(0), one(0), one(1), one(10), one(0), one(1), one(2), one(1))

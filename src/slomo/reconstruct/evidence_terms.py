@@ -114,7 +114,6 @@ def parts(e: Evidence, s: State) -> Tensor:
     row = ((s.v[:, :n] + 0.5 - y0) * (S / side)).long().clamp(0, S - 1)
     cell = s.seen[:, None], row, column
     of = e.part_capsules[e.part[cell]]
-    sd = s.sd[:, :, :n].gather(-1, of.flatten(2).expand(len(s.sd), -1, -1, -1))
-    near = sd.unflatten(-1, of.shape[2:]).amin(-1).clamp(min=0) / PART_PX
+    near = silhouette.least_of(s.sd[:, :, :n], of.expand(len(s.sd), *of.shape)).clamp(min=0) / PART_PX
     far = (e.chance[cell] * near / (1 + near / 3)).sum(-1)
     return (far.mean(2) * e.parts_weight[s.seen]).mean(1)

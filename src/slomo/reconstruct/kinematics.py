@@ -3,6 +3,7 @@
 Shape variables are unit normals: each is multiplied by the spread of what it changes; the prior is their square.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import torch
@@ -90,7 +91,12 @@ class Kinematics:
         depth = [0]
         for j in range(1, self.B):
             depth.append(depth[int(self.link[j])] + 1)
-        self.levels = [i([j for j in range(self.B) if depth[j] == d]) for d in range(1, max(depth) + 1)]
+        # Links level by level, each with its parent's place in the level before; and each link's place among them all.
+        by_depth = [[j for j in range(self.B) if depth[j] == d] for d in range(max(depth) + 1)]
+        self.levels = [
+            (i(own), i([above.index(int(self.link[j])) for j in own])) for above, own in itertools.pairwise(by_depth)
+        ]
+        self.place = i(list(itertools.chain(*by_depth))).argsort()
         self.contacts = i(list(skeleton.contacts))
 
     def shape_variables(self, H: int) -> dict[str, Tensor]:
@@ -121,17 +127,12 @@ class Kinematics:
         H = len(position)
         offset = self.offsets(shape)
         local = joint_rotation(q)
-        R: list[Tensor] = [R_root] * self.B
-        p: list[Tensor] = [position] * self.B
-        for level in self.levels:
-            parents = [int(self.link[j]) for j in level]
-            Rp = torch.stack([R[k] for k in parents], 2)
-            pp = torch.stack([p[k] for k in parents], 2)
-            Rl = Rp @ local[:, :, level]
-            pl = pp + (Rp @ offset[:, None, level, :, None])[..., 0]
-            for n, j in enumerate(level.tolist()):
-                R[j], p[j] = Rl[:, :, n], pl[:, :, n]
-        Rs, ps = torch.stack(R, 2), torch.stack(p, 2)
+        R, p = [R_root[:, :, None]], [position[:, :, None]]
+        for own, parent in self.levels:
+            Rp = R[-1][:, :, parent]
+            p.append(p[-1][:, :, parent] + (Rp @ offset[:, None, own, :, None])[..., 0])
+            R.append(Rp @ local[:, :, own])
+        Rs, ps = torch.cat(R, 2)[:, :, self.place], torch.cat(p, 2)[:, :, self.place]
         points = self.link[self.B :]
         tips = ps[:, :, points] + (Rs[:, :, points] @ offset[:, None, self.B :, :, None])[..., 0]
         length = shape["log_length"].exp()

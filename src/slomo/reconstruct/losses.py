@@ -35,6 +35,7 @@ class State:
         R_cam, centre: (H, F, 3, 3) world to camera, (H, F, 3).
         seen: frames drawn for image terms (S,), as positions among the fit frames; u, v: (S, P) px, flat index
             `pixel`; the first `inside` of P lie in the mask. out: outline of the capsules there; sd, h: (H, S, P, C).
+        near, least, nearest: (H, S, P) smooth minimum and minimum of sd over the capsules, and where that is.
         ends: camera-frame capsule ends (H, F, C, 3) a and b.
         stance: (H, F-1, L) hypothetical contact times its present weight; negative where there is none.
         x: all variables by name, for terms that have some of their own.
@@ -57,6 +58,9 @@ class State:
     out: Outline
     sd: Tensor
     h: Tensor
+    near: Tensor
+    least: Tensor
+    nearest: Tensor
     ends: tuple[Tensor, Tensor]
     stance: Tensor
     x: Mapping[str, Tensor]
@@ -73,12 +77,11 @@ def _frame_mean(s: State, x: Tensor, weight: Tensor) -> Tensor:
 
 def mask(s: State) -> Tensor:
     """Soft occupancy against the mask, mask and background weighted alike, over the whole frame."""
-    near = silhouette.soft_min(s.sd, SOFT_PX)
-    empty = torch.sigmoid(near / SOFT_PX)
+    empty = torch.sigmoid(s.near / SOFT_PX)
     n = s.inside
     one = torch.ones_like(s.u)
     miss = _frame_mean(s, empty[:, :, :n], one[:, :n])
-    owed = torch.where(s.kin.c_tail, TAIL_COVERS, 1.0)[s.sd[:, :, n:].argmin(-1)]
+    owed = torch.where(s.kin.c_tail, TAIL_COVERS, 1.0)[s.nearest[:, :, n:]]
     extra = _frame_mean(s, owed * (1 - empty[:, :, n:]), one[:, n:])
     return miss + extra
 
@@ -86,21 +89,17 @@ def mask(s: State) -> Tensor:
 def reach(s: State) -> Tensor:
     """How far mask pixels are from the body, and bones from the mask: gradients from afar, in units of 5 px."""
     n = s.inside
-    near = s.sd[:, :, :n].amin(-1).clamp(min=0) / 5.0
+    near = s.least[:, :, :n].clamp(min=0) / 5.0
     # Far pieces of a mask that swallowed something else pull less and less.
     far = (torch.sqrt(near**2 + 0.01) - 0.1) / (1 + near / 6)
     unexplained = _frame_mean(s, far, torch.ones_like(s.u[:, :n]))
     o, K = s.out, s.obs.K
-    edge = s.obs.edge[s.seen]
-    x = torch.cat([o.ua, o.ub, (o.ua + o.ub) / 2], -1) * (2 / (K.width - 1)) - 1
-    y = torch.cat([o.va, o.vb, (o.va + o.vb) / 2], -1) * (2 / (K.height - 1)) - 1
+    u = torch.cat([o.ua, o.ub, (o.ua + o.ub) / 2], -1)
+    v = torch.cat([o.va, o.vb, (o.va + o.vb) / 2], -1)
     r = torch.cat([o.ra, o.rb, (o.ra + o.rb) / 2], -1)
-    H, S, N = x.shape
-    grid = torch.stack([x, y], -1).permute(1, 0, 2, 3).reshape(S, H * N, 1, 2)
-    away = torch.nn.functional.grid_sample(edge, grid, padding_mode="border", align_corners=True)
-    away = away.reshape(S, H, N).permute(1, 0, 2)
+    away = silhouette.sampled(s.obs.edge, s.seen, u, v)
     # A bone's axis lies its radius inside; outside the picture nothing is known.
-    shown = ((x.abs() < 1) & (y.abs() < 1)).float() * s.obs.quality[s.seen][:, None]
+    shown = ((u > 0) & (u < K.width - 1) & (v > 0) & (v < K.height - 1)).float() * s.obs.quality[s.seen][:, None]
     shown = shown * torch.where(s.kin.c_tail, TAIL_OUTSIDE, 1.0).repeat(3)
     over = (away + 0.6 * r).clamp(min=0) / 5.0
     outside = ((torch.sqrt(over**2 + 0.01) - 0.1) * shown).sum((1, 2)) / (shown.sum((1, 2)) + 1e-6)
@@ -109,29 +108,28 @@ def reach(s: State) -> Tensor:
 
 def misfit(s: State) -> Tensor:
     """(H, S) of each drawn frame: its mask's pixels missed, background covered, and mask pixels far from any bone."""
-    near = silhouette.soft_min(s.sd, SOFT_PX)
-    empty, n = torch.sigmoid(near / SOFT_PX), s.inside
-    far = s.sd[:, :, :n].amin(-1).clamp(min=0) / 5.0
+    empty, n = torch.sigmoid(s.near / SOFT_PX), s.inside
+    far = s.least[:, :, :n].clamp(min=0) / 5.0
     return empty[:, :, :n].mean(-1) + (1 - empty[:, :, n:]).mean(-1) + 0.5 * (far / (1 + far / 6)).mean(-1)
 
 
 def flow(s: State) -> Tensor:
     """Optical flow: the surface point that a mask pixel sees moves with its link to the next fit frame."""
     obs, K = s.obs, s.obs.K
-    pairs = s.seen < len(obs.at) - 1
-    k = s.seen[pairs]
-    u, v, pixel = s.u[pairs][:, : s.inside], s.v[pairs][:, : s.inside], s.pixel[pairs][:, : s.inside]
-    sub = Outline(**{f: getattr(s.out, f)[:, pairs] for f in Outline.__dataclass_fields__})
-    c, meets = silhouette.visible(K, sub, s.sd[:, pairs][:, :, : s.inside], s.h[:, pairs][:, :, : s.inside])
+    # Frames are drawn in order, so that the last of the clip, which has no next one, can only be the last here.
+    m, n = int((s.seen < len(obs.at) - 1).sum()), s.inside
+    k, u, v, pixel = s.seen[:m], s.u[:m, :n], s.v[:m, :n], s.pixel[:m, :n]
+    sub = Outline(**{f: getattr(s.out, f)[:, :m] for f in Outline.__dataclass_fields__})
+    c, meets = silhouette.visible(K, sub, s.sd[:, :m, :n], s.h[:, :m, :n])
     X = silhouette.surface(K, sub, c, u, v)
     predicted = carry(s, k, c, X) - torch.stack([u, v], -1)
-    observed = torch.stack([obs.flow[i][p] for i, p in zip(k.tolist(), pixel, strict=True)])
-    fine = torch.stack([obs.flow_ok[i][p] for i, p in zip(k.tolist(), pixel, strict=True)]).float()
+    where = k[:, None] * obs.flow.shape[1] + pixel
+    observed, fine = obs.flow.flatten(0, 1)[where], obs.flow_ok.flatten()[where].float()
     error = torch.sqrt(((predicted - observed) ** 2).sum(-1) + FLOW_PX**2) - FLOW_PX
     # Robust: wrong flow at occlusions must not pull; saturates at about the flow's own size.
     size = 2.0 + obs.flow_size
     w = fine * meets.float() * obs.quality[k][:, None]
-    e = size * (1 - torch.exp(-error / size))
+    e = size * (1 - torch.exp((-error / size).clamp(min=-60)))  # exp() is slow where it underflows
     return (e * w).sum((1, 2)) / (w.sum((1, 2)) + 0.2 * w[0].numel() / 4) / (1.0 + 0.25 * obs.flow_size)
 
 
@@ -176,14 +174,11 @@ def contact_weight(s: State) -> Tensor:
         limit = 0.35 + 0.45 * travel[..., None]
         slow = torch.sigmoid((limit - velocity[..., :2].norm(dim=-1)) / (0.25 * limit))
         X = silhouette.to_camera(s.R_cam, s.centre, x)
-        u, v, _ = silhouette.project(s.obs.K, X)
         K = s.obs.K
-        grid = torch.stack([u * (2 / (K.width - 1)) - 1, v * (2 / (K.height - 1)) - 1], -1)[:, :-1]
-        H, F1, N = grid.shape[:3]
-        still = torch.nn.functional.grid_sample(
-            s.obs.static[:-1], grid.permute(1, 0, 2, 3).reshape(F1, H * N, 1, 2), align_corners=True
-        )
-        still = still.reshape(F1, H, N).permute(1, 0, 2)
+        u, v, _ = silhouette.project(K, X)
+        u, v = u[:, :-1], v[:, :-1]
+        seen = (u > -1) & (u < K.width) & (v > -1) & (v < K.height)
+        still = silhouette.sampled(s.obs.static, torch.arange(len(s.obs.dt)), u, v) * seen
         own = low * slow * (0.4 + 0.6 * still)
         return torch.where(s.stance < 0, own, torch.maximum(own, s.stance))
 

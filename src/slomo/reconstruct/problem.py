@@ -68,8 +68,8 @@ class Problem:
         half = pixels // 2
         r = torch.rand(2, len(seen), half, generator=generator, dtype=torch.float64)
         n = self.obs.mask.shape[1] - 1
-        inside = torch.searchsorted(self.obs.draw_in[seen], r[0]).clamp(max=n)
-        outside = torch.searchsorted(self.obs.draw_out[seen], r[1]).clamp(max=n)
+        inside = _found(self.obs.draw_in, seen, r[0]).clamp(max=n)
+        outside = _found(self.obs.draw_out, seen, r[1]).clamp(max=n)
         return Draw(seen, torch.cat([inside, outside], 1), half)
 
     def state(self, x: Variables, guess: Guess, draw: Draw, *, stance_weight: float) -> losses.State:
@@ -85,12 +85,13 @@ class Problem:
         u = (draw.pixel % obs.K.width).float()
         v = torch.div(draw.pixel, obs.K.width, rounding_mode="floor").float()
         sd, h = silhouette.distances(out, u, v)
+        near, least, nearest = silhouette.nearest(sd, losses.SOFT_PX)
         hypothetical = guess.stance[:, obs.at][:, :-1]
         stance = torch.where(hypothetical < 0, hypothetical, stance_weight * hypothetical)
         return losses.State(
             obs=obs, kin=kin, body=body, q=q, R_root=R_root, shape=shape, tilt=x["tilt"], R_cam=R_cam, centre=centre,
-            seen=draw.seen, u=u, v=v, pixel=draw.pixel, inside=draw.inside, out=out, sd=sd, h=h, ends=(a, b),
-            stance=stance, x=x,
+            seen=draw.seen, u=u, v=v, pixel=draw.pixel, inside=draw.inside, out=out, sd=sd, h=h, near=near, least=least,
+            nearest=nearest, ends=(a, b), stance=stance, x=x,
         )  # fmt: skip
 
     def loss(self, x: Variables, guess: Guess, draw: Draw, *, stance_weight: float = 0.0) -> tuple[Tensor, Variables]:
@@ -98,6 +99,12 @@ class Problem:
         state = self.state(x, guess, draw, stance_weight=stance_weight)
         parts = {name: term(state) for name, term in self.terms.items() if self.weights.get(name, 0) > 0}
         return sum((self.weights[k] * v for k, v in parts.items()), torch.zeros(len(guess.yaw))), parts
+
+
+def _found(cumulative: Tensor, rows: Tensor, r: Tensor) -> Tensor:
+    """(S, n) where r (S, n) in [0, 1] falls in some rows of cumulative probabilities (F, N), one row at a time: the
+    table is large, and indexing would copy it."""
+    return torch.stack([torch.searchsorted(cumulative[k], x) for k, x in zip(rows.tolist(), r, strict=True)])
 
 
 LATE = 0.3  # the part of a phase in which the late variables change

@@ -6,9 +6,11 @@ axis minus the projected radius there. Occupancy is a sigmoid of the smooth mini
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from slomo.pinhole import Intrinsics
+from slomo.reconstruct import capsule_kernels
 
 Tensor = torch.Tensor
 
@@ -48,7 +50,7 @@ def outline(K: Intrinsics, a: Tensor, b: Tensor, radii: Tensor) -> Outline:
 
 
 class _Distance(torch.autograd.Function):
-    """Signed distance px and place along the axis, with the gradient written out (autograd would keep twenty arrays).
+    """Signed distance px and place along the axis.
 
     The place h on the axis is the closest one, so its own change does not change the distance to the axis (envelope
     theorem); that it changes the radius of a tapered capsule a little is left out of the gradient.
@@ -56,26 +58,22 @@ class _Distance(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, ua, va, ub, vb, ra, rb, u, v):  # type: ignore[override]
-        bu, bv = (ub - ua)[:, :, None], (vb - va)[:, :, None]
-        pu, pv = u[None, :, :, None] - ua[:, :, None], v[None, :, :, None] - va[:, :, None]
-        h = (pu * bu).addcmul_(pv, bv).div_(bu * bu + bv * bv + 1e-6).clamp_(0, 1)
-        pu.addcmul_(h, bu, value=-1)
-        pv.addcmul_(h, bv, value=-1)
-        d = (pu * pu).addcmul_(pv, pv).add_(1e-6).sqrt_()
-        pu.div_(d)
-        pv.div_(d)
-        ctx.save_for_backward(pu, pv, h)
-        sd = d.sub_(ra[:, :, None]).addcmul_(h, (rb - ra)[:, :, None], value=-1)
+        H, T, C = ua.shape
+        outline = torch.stack([ua, va, ub, vb, ra, rb]).reshape(6, H * T, C).numpy()
+        pixels = torch.stack([u, v])[:, None].expand(2, H, *u.shape).reshape(2, H * T, -1).numpy()
+        sd, h = (torch.empty(H * T, u.shape[1], C, dtype=ua.dtype) for _ in range(2))
+        capsule_kernels.distances(outline, pixels, sd.numpy(), h.numpy())
+        ctx.kept, ctx.shape = (outline, pixels, h.numpy()), ua.shape
+        h = h.view(H, T, -1, C)
         ctx.mark_non_differentiable(h)
-        return sd, h
+        return sd.view(H, T, -1, C), h
 
     @staticmethod
     def backward(ctx, g, _):  # type: ignore[override]
-        nu, nv, h = ctx.saved_tensors
-        gb = g * h
-        ga = g - gb
-        sums = [-(ga * nu).sum(2), -(ga * nv).sum(2), -(gb * nu).sum(2), -(gb * nv).sum(2), -ga.sum(2), -gb.sum(2)]
-        return *sums, None, None
+        outline, pixels, h = ctx.kept
+        out = torch.empty(outline.shape, dtype=g.dtype)
+        capsule_kernels.distances_back(outline, pixels, h, g.reshape(h.shape).contiguous().numpy(), out.numpy())
+        return *out.view(6, *ctx.shape).unbind(0), None, None
 
 
 def distances(o: Outline, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
@@ -83,19 +81,79 @@ def distances(o: Outline, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
     return _Distance.apply(o.ua, o.va, o.ub, o.vb, o.ra, o.rb, u, v)  # type: ignore[return-value]
 
 
-def soft_min(sd: Tensor, temperature: float) -> Tensor:
-    """Smooth minimum over the last axis, in the unit of sd."""
-    return -temperature * torch.logsumexp(sd / -temperature, -1)
+def sampled(pictures: Tensor, which: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """(H, S, N) bilinear values of pictures (F, 1, h, w), the ones `which` (S,), at u, v (H, S, N) px; the border's
+    outside."""
+    height, width = pictures.shape[-2:]
+    u, v = u.clamp(0, width - 1), v.clamp(0, height - 1)
+    left, top = u.detach().floor().clamp(max=width - 2), v.detach().floor().clamp(max=height - 2)
+    first = (which * (height * width))[:, None] + (top * width + left).long()
+    flat, a, b = pictures.flatten(), u - left, v - top
+    above = flat[first] * (1 - a) + flat[first + 1] * a
+    return above * (1 - b) + (flat[first + width] * (1 - a) + flat[first + width + 1] * a) * b
+
+
+class _Nearest(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, sd, temperature):  # type: ignore[override]
+        rows, shape = _rows(sd), sd.shape[:-1]
+        soft, least = torch.empty(2, len(rows), dtype=sd.dtype)
+        which = torch.empty(len(rows), dtype=torch.long)
+        capsule_kernels.nearest(rows, temperature, soft.numpy(), least.numpy(), which.numpy())
+        ctx.rows, ctx.temperature, ctx.soft, ctx.which = rows, temperature, soft.numpy(), which.numpy()
+        which = which.view(shape)
+        ctx.mark_non_differentiable(which)
+        return soft.view(shape), least.view(shape), which
+
+    @staticmethod
+    def backward(ctx, g_soft, g_least, _):  # type: ignore[override]
+        out = torch.empty(*g_soft.shape, ctx.rows.shape[1], dtype=g_soft.dtype)
+        soft, least = (x.reshape(-1).contiguous().numpy() for x in (g_soft, g_least))
+        rows = out.numpy().reshape(ctx.rows.shape)
+        capsule_kernels.nearest_back(ctx.rows, ctx.temperature, ctx.soft, ctx.which, soft, least, rows)
+        return out, None
+
+
+def nearest(sd: Tensor, temperature: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Smooth minimum over the last axis in the unit of sd, the minimum, and where that is."""
+    return _Nearest.apply(sd, temperature)  # type: ignore[return-value]
+
+
+class _LeastOf(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, sd, of):  # type: ignore[override]
+        M, K = of[..., 0].numel() // of.shape[-2], of.shape[-2]
+        least, which = torch.empty(M, K, dtype=sd.dtype), torch.empty(M, K, dtype=torch.long)
+        capsule_kernels.least_of(_rows(sd), of.reshape(M, K, -1).contiguous().numpy(), least.numpy(), which.numpy())
+        ctx.shape, ctx.which = sd.shape, which
+        return least.view(of.shape[:-1])
+
+    @staticmethod
+    def backward(ctx, g):  # type: ignore[override]
+        out = torch.zeros(ctx.shape, dtype=g.dtype)
+        g = g.reshape(ctx.which.shape).contiguous()
+        capsule_kernels.least_of_back(ctx.which.numpy(), g.numpy(), out.numpy().reshape(-1, ctx.shape[-1]))
+        return out, None
+
+
+def least_of(sd: Tensor, of: Tensor) -> Tensor:
+    """(..., K) minimum of sd (..., C) over some of its last axis, `of` (..., K, S)."""
+    return _LeastOf.apply(sd, of)  # type: ignore[return-value]
+
+
+def _rows(x: Tensor) -> np.ndarray:
+    """(M, C) of (..., C), outside the graph."""
+    return x.detach().reshape(-1, x.shape[-1]).contiguous().numpy()
 
 
 def visible(K: Intrinsics, o: Outline, sd: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
     """The capsule that each pixel sees, (H, T, P), and whether it sees one: the nearest front of those it meets."""
-    with torch.no_grad():
-        radius = o.ra[:, :, None] + h * (o.rb - o.ra)[:, :, None]
-        z = o.za[:, :, None] + h * (o.zb - o.za)[:, :, None]
-        bulge = (1 - ((sd + radius) / radius).clamp(0, 1) ** 2).sqrt()
-        front = z * (1 - bulge * radius / K.fx)
-        return torch.where(sd < 0.5, front, 1e4 + sd).argmin(-1), (sd < 0.5).any(-1)
+    which, meets = (torch.empty(sd.shape[:-1], dtype=kind) for kind in (torch.long, torch.bool))
+    N, C = o.za.shape[0] * o.za.shape[1], o.za.shape[2]
+    ends = torch.stack([o.za, o.zb, o.ra, o.rb]).detach().reshape(4, N, C).numpy()
+    d, t = (x.detach().reshape(N, -1, C).contiguous().numpy() for x in (sd, h))
+    capsule_kernels.visible(ends, K.fx, d, t, which.numpy().reshape(N, -1), meets.numpy().reshape(N, -1))
+    return which, meets
 
 
 def surface(K: Intrinsics, o: Outline, c: Tensor, u: Tensor, v: Tensor) -> Tensor:

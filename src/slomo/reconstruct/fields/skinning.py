@@ -124,12 +124,10 @@ def rotations(kin: Kinematics, q: Tensor) -> Tensor:
         [cy * cx * cz + sy * sx * sz, cy * sx * cz + sy * cx * sz,
          sy * cx * cz - cy * sx * sz, cy * cx * sz - sy * sx * cz], -1
     )  # fmt: skip
-    out = [torch.tensor([1.0, 0.0, 0.0, 0.0], device=q.device).expand(len(q), 4)] * kin.B
-    for level in kin.levels:
-        parents = torch.stack([out[int(kin.link[j])] for j in level], 1)
-        for n, r in enumerate(product(parents, local[:, level]).unbind(1)):
-            out[int(level[n])] = r
-    return torch.stack(out, 1)
+    out = [torch.tensor([1.0, 0.0, 0.0, 0.0], device=q.device).expand(len(q), 1, 4)]
+    for own, parent in kin.levels:
+        out.append(product(out[-1][:, parent], local[:, own]))
+    return torch.cat(out, 1)[:, kin.place]
 
 
 def bones(kin: Kinematics, body: Posed, R_root: Tensor, q: Tensor, at: Tensor, rest: Rest) -> Bones:
