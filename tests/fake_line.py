@@ -31,11 +31,13 @@ class MasksConfig:
     segmenter: str = "motion"
     subject_at: tuple[float, ...] = ()
     subject_box: tuple[float, ...] = ()
+    quality: str = "normal"
 
 
 @dataclasses.dataclass(frozen=True)
 class CameraConfig:
     fov_deg: float = 0.0
+    quality: str = "normal"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -58,6 +58,10 @@ def test_every_command_has_help_with_an_example(name):
     assert "--project" in text
 
 
+def test_version():
+    assert run("--version").stdout == f"slomo {slomo.__version__}\n"
+
+
 def test_help_starts_fast():
     code = f"import sys; from slomo.cli import app; print([m for m in {HEAVY} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -169,6 +173,17 @@ def test_whom_the_user_means(project):
     assert masks() == {}
     assert "no list of numbers" in run("reconstruct", "--subject-at", "here", code=2).stderr
     assert "give one of them" in run("reconstruct", "--subject-at", "1,2", "--subject-box", "1,2,3,4", code=2).stderr
+
+
+def test_quality_is_that_of_masks_and_camera_too(project):
+    def said():
+        made = pipeline.Project(project)
+        return [made.config(stage).quality for stage in ("masks", "camera", "fit", "reconstruct")]
+
+    run("reconstruct", "clip.txt", "--quality", "draft")
+    assert said() == ["draft"] * 4
+    run("reconstruct", "--quality", "high", "--set", "masks.quality=normal")
+    assert said() == ["normal", "high", "high", "high"]
 
 
 def test_masks_given_are_used(project):

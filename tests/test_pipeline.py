@@ -288,7 +288,8 @@ def test_a_manifest_says_how_it_was_made(project):
     (path,) = project.glob(".slomo/store/masks/*/manifest.json")
     m = json.loads(path.read_text())
     assert m["notes"] == ["masks by motion"]
-    assert m["identity"]["config"] == {"segmenter": "motion", "subject_at": [], "subject_box": []}
+    settings = {"segmenter": "motion", "subject_at": [], "subject_box": [], "quality": "normal"}
+    assert m["identity"]["config"] == settings
     assert m["packages"]["numpy"] == np.__version__
     assert {"seconds", "started", "command", "git", "device", "python", "content"} <= m.keys()
     assert json.loads((project / "out" / "masks.json").read_text())["directory"] == m["directory"]

@@ -77,10 +77,11 @@ STAGES: dict[str, StageSpec] = {
         StageSpec("decode", _RECONSTRUCT, "reconstruct", "run_decode", "DecodeConfig", "DECODE_VERSION", (), ("clip",)),
         StageSpec(
             "masks", _RECONSTRUCT, "reconstruct", "run_masks", "MasksConfig", "MASKS_VERSION", ("decode",),
-            optional=("masks", "weights"),
+            optional=("masks", "weights"), shares=("quality",),
         ),
         StageSpec(
-            "camera", _RECONSTRUCT, "reconstruct", "run_camera", "CameraConfig", "CAMERA_VERSION", ("decode", "masks")
+            "camera", _RECONSTRUCT, "reconstruct", "run_camera", "CameraConfig", "CAMERA_VERSION", ("decode", "masks"),
+            shares=("quality",),
         ),
         StageSpec(
             "evidence", "slomo.prior.stage", "reconstruct", upstream=("decode", "masks", "camera"),

@@ -1,9 +1,11 @@
 """The command line: parse, call the pipeline, print the artifact's path."""
 
 import sys
+from typing import Annotated
 
 import typer
 
+from slomo import __version__
 from slomo.cli import deploy, export, project, stages, tools, track
 
 app = typer.Typer(
@@ -17,6 +19,22 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"slomo {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show slomo's version and exit.")
+    ] = False,
+) -> None: ...
+
+
 stages.add_commands(app)
 track.add_commands(app)
 project.add_commands(app)

@@ -1,4 +1,4 @@
-"""The inner loops of the silhouette, compiled: torch would write and read an array of all pixels and capsules each step.
+"""The inner loops of the silhouette, compiled: torch would write and read arrays of all pixels and capsules each time.
 
 Of N pictures: outlines (6, N, C), which are u, v of one end, of the other, and the two radii; pixels (2, N, P);
 distances and places on the axis (N, P, C). All of one type, float32 unless derivatives are checked.

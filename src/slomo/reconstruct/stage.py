@@ -13,8 +13,9 @@ from slomo.reconstruct.video import decode
 from slomo.stage import Artifact, Inputs, Progress
 
 DECODE_VERSION = 2
-MASKS_VERSION = 6
-CAMERA_VERSION = 5
+MASKS_VERSION = 7
+CAMERA_VERSION = 6
+DRAFT = "draft"
 
 SEGMENTERS = ("auto", "u2netp", "still", "motion", "user")
 _LOST = 0.05  # part of the frames without the subject, from which on the other masks are taken
@@ -49,14 +50,17 @@ class MasksConfig:
         segmenter: "auto" (the user's masks when given, else u2netp when its weights are at hand, else motion; before a
             camera that stands still "still" where those find nothing or too little), "u2netp", "still", "motion" or
             "user".
-        network_every: the network runs on every n-th frame; flow fills the frames between.
+        quality: that of [reconstruct] unless it is set here.
+        network_every: the network runs on every n-th frame; flow fills the frames between. 0: every frame, every third
+            at draft quality.
         subject_at: (u, v) or (u, v, s), a pixel of the upright clip on the subject, and when; without a time, in the
             first frame used. Empty: the largest.
         subject_box: (u0, v0, u1, v1) or with a time, a box around it instead.
     """
 
     segmenter: str = "auto"
-    network_every: int = 1
+    quality: str = "normal"
+    network_every: int = 0
     subject_at: tuple[float, ...] = ()
     subject_box: tuple[float, ...] = ()
 
@@ -70,7 +74,9 @@ class CameraConfig:
             else `default_fov_deg`, and refined where the motion shows it. A given one is kept.
         default_fov_deg: degrees, along the frames' longer side, where nothing else is known: between phones (55 to 65)
             and what was zoomed in.
+        quality: that of [reconstruct] unless it is set here.
         key_every: every n-th frame goes through structure from motion; fewer do of a clip that has more than 120 such.
+            0: every third, every sixth at draft quality.
         features: features a key frame.
         overlap: key frames with which each is matched.
         seed: of every random choice.
@@ -78,7 +84,8 @@ class CameraConfig:
 
     fov_deg: float = 0.0
     default_fov_deg: float = 53.0
-    key_every: int = 3
+    quality: str = "normal"
+    key_every: int = 0
     features: int = 1200
     overlap: int = 5
     seed: int = 0
@@ -183,7 +190,7 @@ def run_camera(inputs: Inputs, config: CameraConfig, progress: Progress) -> Arti
         focal=focal,
         focal_std=share * focal,
         refine_focal=not config.fov_deg,
-        key_every=config.key_every,
+        key_every=config.key_every or (6 if config.quality == DRAFT else 3),
         features=config.features,
         overlap=config.overlap,
         seed=config.seed,
@@ -265,7 +272,8 @@ def _segmenter(inputs: Inputs, config: MasksConfig, choice):
                 where="masks.segmenter",
                 todo=f"set {WEIGHTS_VARIABLE} to their path, or use --segmenter motion",
             )
-        return SaliencySegmenter(U2Net(inputs.files["weights"]), choice, every=max(1, config.network_every))
+        every = config.network_every or (3 if config.quality == DRAFT else 1)
+        return SaliencySegmenter(U2Net(inputs.files["weights"]), choice, every=max(1, every))
     if name == "still":
         from slomo.reconstruct.still_segment import StillSegmenter
 
