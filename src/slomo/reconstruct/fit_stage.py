@@ -21,12 +21,12 @@ from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import Skeleton, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 12
+FIT_VERSION = 13
 
 POLISH = 0.4  # share of the rates with which the chunks of a long clip are polished together
 
 # Of the heading, gait, rivals and final phase.
-ITERATIONS = {"draft": (60, 60, 80, 250), "normal": (100, 120, 150, 1000), "high": (150, 200, 300, 1400)}
+ITERATIONS = {"draft": (60, 60, 80, 250), "normal": (100, 120, 150, 400), "high": (150, 200, 300, 600)}
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class FitConfig:
     weight_flow: float = 0.8
     weight_stance: float = 0.5
     weight_ground: float = 0.3
-    weight_limits: float = 0.05
+    weight_limits: float = 0.1
     weight_smooth: float = 0.03
     weight_forward: float = 0.25
     weight_balance: float = 0.01

@@ -66,11 +66,13 @@ def give_back_patches(frames: np.ndarray, layers: dict[int, np.ndarray], flow: F
             break
         model = learn_colours(frames, there, reach=2.0)
         find = partial(_patches, frames, bodies=bodies, model=model, flow=flow)
-        for k, gone in list(zip(there, in_order(find, there), strict=True)):
-            if gone.any():
-                changed.add(k)
-                bodies[k] &= ~gone
-                layers[k] = np.where(grown(gone, 0.1) & ~bodies[k], 0, layers[k]).astype(np.float16)
+        taken = {k: gone for k, gone in zip(there, in_order(find, there), strict=True) if gone.any()}
+        if not taken:
+            break
+        changed |= taken.keys()
+        for k, gone in taken.items():
+            bodies[k] &= ~gone
+            layers[k] = np.where(grown(gone, 0.1) & ~bodies[k], 0, layers[k]).astype(np.float16)
     return len(changed)
 
 
