@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import torch
+from scipy.spatial.transform import Rotation
 
 from slomo.errors import InvalidData, UsageError
 from slomo.motion import KeypointMotion
@@ -121,6 +122,7 @@ def test_a_walk_is_found(walk):
     assert report["scale_source"] == "typical length of quadruped"
     assert report["swap_margin"] is not None
     assert report["evidence"] == []
+    assert report["camera_tremble_deg"] == 0
     assert report["verdict"]["trust"] in ("good", "fair")
     motion = KeypointMotion.from_arrays(out.npz["keypoints.npz"])
     names = load_skeleton("quadruped").names
@@ -186,6 +188,19 @@ def test_a_length_sets_the_scale(walk):
     ratio = b.npz["keypoints.npz"]["keypoints"] / a.npz["keypoints.npz"]["keypoints"]
     assert np.median(ratio) == pytest.approx(2.0, rel=0.02)
     assert b.json["report.json"]["scale_source"] == "length_m"
+
+
+def test_a_trembling_camera_is_taken_back(walk):
+    _, masks, flow = walk
+    inputs = _inputs(masks, flow)
+    axis = np.random.default_rng(1).standard_normal((T, 3))
+    turn = Rotation.from_rotvec(np.radians(0.5) * axis / np.linalg.norm(axis, axis=1, keepdims=True)).as_matrix()
+    inputs.artifacts["camera"].npz["camera.npz"]["T_world_cam"][:, :3, :3] @= turn
+    out = reconstruct(inputs, TINY, Silent())
+    assert out.json["report.json"]["camera_tremble_deg"] == pytest.approx(0.5, abs=0.15)
+    R = Rotation.from_matrix(out.npz["keypoints.npz"]["T_world_cam"][:, :3, :3])
+    left = np.degrees((R.mean().inv() * R).magnitude())
+    assert left.mean() < 0.2, left
 
 
 def test_masks_of_something_else_fail(walk):

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from slomo.mesh import SkinnedMesh
 from slomo.reconstruct.body_colours import coloured_by_clip
@@ -21,7 +22,8 @@ from slomo.reconstruct.run import Run, from_arrays
 from slomo.reconstruct.verdict import Facts, checks, verdict
 from slomo.stage import Artifact, Inputs, Progress
 
-REFINE_VERSION = 7
+REFINE_VERSION = 8
+TREMBLES = 0.1  # degrees of a camera's rotation, of which the user is told
 
 
 @dataclass(frozen=True)
@@ -79,9 +81,12 @@ def run_refine(inputs: Inputs, config: ReconstructConfig, progress: Progress) ->
         body = _mesh(made, run, outcome, plan.fields, frames)
     source = "length_m" if config.length_m else f"typical length of {made.skeleton.name}"
     progress.note(f"size: {made.metres:g} m from {source}; the video alone does not tell it")
+    tremble = _tremble(inputs.artifacts["camera"].npz["camera.npz"]["T_world_cam"], made.problem.obs.T_world_cam)
+    if tremble > TREMBLES:
+        progress.note(f"camera: its rotation trembles by {tremble:.2f} degrees, which the background's flow takes back")
     report: dict[str, Any] = outcome.report | {
         "skeleton": made.skeleton.name, "camera_mode": made.camera_mode, "length_m": made.metres,
-        "scale_source": source, "evidence": made.evidence, "quality": config.quality,
+        "scale_source": source, "evidence": made.evidence, "quality": config.quality, "camera_tremble_deg": tremble,
         "seconds": round(time.perf_counter() - began, 1), "cpu_seconds": round(time.process_time() - cpu, 1),
     }  # fmt: skip
     report["verdict"] = found = verdict(checks(_facts(inputs, made, run, outcome)))
@@ -89,6 +94,12 @@ def run_refine(inputs: Inputs, config: ReconstructConfig, progress: Progress) ->
     failure = f"not usable: {found['text']}" if found["trust"] == "unusable" else None
     npz = {"keypoints.npz": _arrays(made, outcome), "mesh.npz": body.to_arrays()}
     return Artifact(npz=npz, json={"report.json": report}, failure=failure)
+
+
+def _tremble(given: np.ndarray, steady: np.ndarray) -> float:
+    """Degrees, root mean square of the turns between two paths (T, 4, 4) of a camera."""
+    turns = Rotation.from_matrix(np.asarray(given, float)[:, :3, :3].swapaxes(1, 2) @ steady[:, :3, :3]).magnitude()
+    return round(float(np.degrees(np.sqrt(np.mean(turns**2)))), 3)
 
 
 def _facts(inputs: Inputs, made: Prepared, run: Run, outcome: Outcome) -> Facts:
