@@ -167,11 +167,11 @@ def contact_weight(s: State) -> Tensor:
     """
     with torch.no_grad():
         height, velocity, x = feet(s)
-        low = torch.sigmoid((0.10 - torch.maximum(height[:, 1:], height[:, :-1])) / 0.03)
+        low = torch.sigmoid((0.07 - torch.maximum(height[:, 1:], height[:, :-1])) / 0.02)
         L = s.body.length[:, None]
         root = s.body.nodes[:, :, 0]
         travel = (root[:, 1:] - root[:, :-1]).norm(dim=-1) / L / s.obs.dt
-        limit = 0.35 + 0.45 * travel[..., None]
+        limit = 0.35 + 0.2 * travel[..., None]
         slow = torch.sigmoid((limit - velocity[..., :2].norm(dim=-1)) / (0.25 * limit))
         X = silhouette.to_camera(s.R_cam, s.centre, x)
         K = s.obs.K
