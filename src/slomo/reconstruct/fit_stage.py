@@ -21,12 +21,12 @@ from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import Skeleton, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 14
+FIT_VERSION = 15
 
 POLISH = 0.4  # share of the rates with which the chunks of a long clip are polished together
 
 # Of the heading, gait, rivals and final phase.
-ITERATIONS = {"draft": (60, 60, 80, 250), "normal": (100, 120, 150, 400), "high": (150, 200, 300, 600)}
+ITERATIONS = {"draft": (50, 50, 60, 120), "normal": (100, 120, 150, 400), "high": (150, 200, 300, 600)}
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ class MasksConfig:
             camera that stands still "still" where those find nothing or too little), "u2netp", "still", "motion" or
             "user".
         quality: that of [reconstruct] unless it is set here.
-        network_every: the network runs on every n-th frame; flow fills the frames between. 0: every frame, every third
+        network_every: the network runs on every n-th frame; flow fills the frames between. 0: every frame, every fourth
             at draft quality.
         subject_at: (u, v) or (u, v, s), a pixel of the upright clip on the subject, and when; without a time, in the
             first frame used. Empty: the largest.
@@ -272,7 +272,7 @@ def _segmenter(inputs: Inputs, config: MasksConfig, choice):
                 where="masks.segmenter",
                 todo=f"set {WEIGHTS_VARIABLE} to their path, or use --segmenter motion",
             )
-        every = config.network_every or (3 if config.quality == DRAFT else 1)
+        every = config.network_every or (4 if config.quality == DRAFT else 1)
         return SaliencySegmenter(U2Net(inputs.files["weights"]), choice, every=max(1, every))
     if name == "still":
         from slomo.reconstruct.still_segment import StillSegmenter
