@@ -59,21 +59,21 @@ class _Distance(torch.autograd.Function):
     @staticmethod
     def forward(ctx, ua, va, ub, vb, ra, rb, u, v):  # type: ignore[override]
         H, T, C = ua.shape
-        outline = torch.stack([ua, va, ub, vb, ra, rb]).reshape(6, H * T, C).numpy()
-        pixels = torch.stack([u, v])[:, None].expand(2, H, *u.shape).reshape(2, H * T, -1).numpy()
+        outline = torch.stack([ua, va, ub, vb, ra, rb]).reshape(6, H * T, C).cpu().numpy()
+        pixels = torch.stack([u, v])[:, None].expand(2, H, *u.shape).reshape(2, H * T, -1).cpu().numpy()
         sd, h = (torch.empty(H * T, u.shape[1], C, dtype=ua.dtype) for _ in range(2))
         capsule_kernels.distances(outline, pixels, sd.numpy(), h.numpy())
         ctx.kept, ctx.shape = (outline, pixels, h.numpy()), ua.shape
-        h = h.view(H, T, -1, C)
+        h = h.view(H, T, -1, C).to(ua.device)
         ctx.mark_non_differentiable(h)
-        return sd.view(H, T, -1, C), h
+        return sd.view(H, T, -1, C).to(ua.device), h
 
     @staticmethod
     def backward(ctx, g, _):  # type: ignore[override]
         outline, pixels, h = ctx.kept
         out = torch.empty(outline.shape, dtype=g.dtype)
-        capsule_kernels.distances_back(outline, pixels, h, g.reshape(h.shape).contiguous().numpy(), out.numpy())
-        return *out.view(6, *ctx.shape).unbind(0), None, None
+        capsule_kernels.distances_back(outline, pixels, h, _rows(g).reshape(h.shape), out.numpy())
+        return *out.view(6, *ctx.shape).to(g.device).unbind(0), None, None
 
 
 def distances(o: Outline, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
@@ -82,11 +82,12 @@ def distances(o: Outline, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def sampled(pictures: Tensor, which: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """(H, S, N) bilinear values of pictures (F, 1, h, w), the ones `which` (S,), at u, v (H, S, N) px; the border's
-    outside."""
+    """(H, S, N) bilinear values of pictures (F, 1, h, w), the ones `which` (S,), at u, v (H, S, N) px; outside a
+    picture those on its border."""
     height, width = pictures.shape[-2:]
     u, v = u.clamp(0, width - 1), v.clamp(0, height - 1)
-    left, top = u.detach().floor().clamp(max=width - 2), v.detach().floor().clamp(max=height - 2)
+    # A pose that is not a number samples anywhere, and stays what it is by the weights.
+    left, top = (x.detach().nan_to_num().floor().clamp(max=n - 2) for x, n in ((u, width), (v, height)))
     first = (which * (height * width))[:, None] + (top * width + left).long()
     flat, a, b = pictures.flatten(), u - left, v - top
     above = flat[first] * (1 - a) + flat[first + 1] * a
@@ -101,17 +102,17 @@ class _Nearest(torch.autograd.Function):
         which = torch.empty(len(rows), dtype=torch.long)
         capsule_kernels.nearest(rows, temperature, soft.numpy(), least.numpy(), which.numpy())
         ctx.rows, ctx.temperature, ctx.soft, ctx.which = rows, temperature, soft.numpy(), which.numpy()
-        which = which.view(shape)
+        which = which.view(shape).to(sd.device)
         ctx.mark_non_differentiable(which)
-        return soft.view(shape), least.view(shape), which
+        return soft.view(shape).to(sd.device), least.view(shape).to(sd.device), which
 
     @staticmethod
     def backward(ctx, g_soft, g_least, _):  # type: ignore[override]
         out = torch.empty(*g_soft.shape, ctx.rows.shape[1], dtype=g_soft.dtype)
-        soft, least = (x.reshape(-1).contiguous().numpy() for x in (g_soft, g_least))
+        soft, least = (_rows(x).ravel() for x in (g_soft, g_least))
         rows = out.numpy().reshape(ctx.rows.shape)
         capsule_kernels.nearest_back(ctx.rows, ctx.temperature, ctx.soft, ctx.which, soft, least, rows)
-        return out, None
+        return out.to(g_soft.device), None
 
 
 def nearest(sd: Tensor, temperature: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -124,16 +125,16 @@ class _LeastOf(torch.autograd.Function):
     def forward(ctx, sd, of):  # type: ignore[override]
         M, K = of[..., 0].numel() // of.shape[-2], of.shape[-2]
         least, which = torch.empty(M, K, dtype=sd.dtype), torch.empty(M, K, dtype=torch.long)
-        capsule_kernels.least_of(_rows(sd), of.reshape(M, K, -1).contiguous().numpy(), least.numpy(), which.numpy())
-        ctx.shape, ctx.which = sd.shape, which
-        return least.view(of.shape[:-1])
+        capsule_kernels.least_of(_rows(sd), _rows(of).reshape(M, K, -1), least.numpy(), which.numpy())
+        ctx.shape, ctx.which = sd.shape, which.numpy()
+        return least.view(of.shape[:-1]).to(sd.device)
 
     @staticmethod
     def backward(ctx, g):  # type: ignore[override]
         out = torch.zeros(ctx.shape, dtype=g.dtype)
-        g = g.reshape(ctx.which.shape).contiguous()
-        capsule_kernels.least_of_back(ctx.which.numpy(), g.numpy(), out.numpy().reshape(-1, ctx.shape[-1]))
-        return out, None
+        rows = out.numpy().reshape(-1, ctx.shape[-1])
+        capsule_kernels.least_of_back(ctx.which, _rows(g).reshape(ctx.which.shape), rows)
+        return out.to(g.device), None
 
 
 def least_of(sd: Tensor, of: Tensor) -> Tensor:
@@ -142,18 +143,18 @@ def least_of(sd: Tensor, of: Tensor) -> Tensor:
 
 
 def _rows(x: Tensor) -> np.ndarray:
-    """(M, C) of (..., C), outside the graph."""
-    return x.detach().reshape(-1, x.shape[-1]).contiguous().numpy()
+    """(M, C) of (..., C), outside the graph, where the compiled loops can read it."""
+    return x.detach().reshape(-1, x.shape[-1]).cpu().contiguous().numpy()
 
 
 def visible(K: Intrinsics, o: Outline, sd: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
     """The capsule that each pixel sees, (H, T, P), and whether it sees one: the nearest front of those it meets."""
     which, meets = (torch.empty(sd.shape[:-1], dtype=kind) for kind in (torch.long, torch.bool))
     N, C = o.za.shape[0] * o.za.shape[1], o.za.shape[2]
-    ends = torch.stack([o.za, o.zb, o.ra, o.rb]).detach().reshape(4, N, C).numpy()
-    d, t = (x.detach().reshape(N, -1, C).contiguous().numpy() for x in (sd, h))
+    ends = _rows(torch.stack([o.za, o.zb, o.ra, o.rb])).reshape(4, N, C)
+    d, t = (_rows(x).reshape(N, -1, C) for x in (sd, h))
     capsule_kernels.visible(ends, K.fx, d, t, which.numpy().reshape(N, -1), meets.numpy().reshape(N, -1))
-    return which, meets
+    return which.to(sd.device), meets.to(sd.device)
 
 
 def surface(K: Intrinsics, o: Outline, c: Tensor, u: Tensor, v: Tensor) -> Tensor:
