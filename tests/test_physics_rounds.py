@@ -29,11 +29,11 @@ def kinematic(T: int = 25, fps: float = 30.0, *, speed: float = 0.0, sunk: float
     return Kinematic(t, position, np.tile(np.eye(3), (T, 1, 1)), np.zeros((T, SKELETON.link_count, 3)), nodes, contact)
 
 
-def learner(k: Kinematic, **config) -> Learner:
+def learner(k: Kinematic, base: Kinematic | None = None, **config) -> Learner:
     kin = Kinematics(SKELETON)
     still = torch.zeros(1, 1, 3), torch.eye(3)[None, None], torch.zeros(1, 1, kin.B, 3)
     body = build(SKELETON, kin.pose(kin.shape_variables(1), *still), unit=LENGTH)
-    return Learner(body, k, SKELETON.mirror[: SKELETON.link_count], PhysicsConfig(**config))
+    return Learner(body, k, SKELETON.mirror[: SKELETON.link_count], PhysicsConfig(**config), base=base)
 
 
 @pytest.mark.parametrize("total", [0.5, 1.2, 3.0, 31.0])
@@ -95,6 +95,16 @@ def test_learning_is_deterministic_and_goes_on_from_plain_arrays():
     a, _ = one.learn(one.start(), np.full(3, 0.1), rate=0.1)
     b, _ = one.learn({k: torch.from_numpy(v.numpy().copy()) for k, v in one.start().items()}, np.full(3, 0.1), rate=0.1)
     assert all(torch.equal(a[k], b[k]) for k in a)
+
+
+def test_what_was_learned_fits_a_body_that_has_sunk_since():
+    """Windows are as long as the body takes to fall from its height, which a later round may have changed."""
+    first = kinematic(T=200)
+    one = learner(first)
+    x, _ = one.learn(one.start(), np.full(1, 0.1), rate=0.1)
+    for sunk in np.linspace(-0.2, 0.3, 11) * SKELETON.root_height * LENGTH:
+        later = learner(kinematic(T=200, sunk=sunk), base=first)
+        assert later.controls(x, 0.1).target.shape[0] == later.windows.count == one.windows.count
 
 
 def test_a_window_that_fell_is_not_trusted():

@@ -82,7 +82,9 @@ class Learner:
         base: Kinematic | None = None, device: str = "cpu",
     ):  # fmt: skip
         self.body, self.kinematic, self.config = body, kinematic, config
-        c, pace = config, float(np.sqrt(np.median(kinematic.position[:, 2]).clip(0.1 * body.length) / GRAVITY))
+        # Of the first round's: what is learned is for its windows, and the body's height changes between rounds.
+        height = np.median((base or kinematic).position[:, 2]).clip(0.1 * body.length)
+        c, pace = config, float(np.sqrt(height / GRAVITY))
         self.windows: Windows = cover(
             kinematic.t, length=c.window * pace, overlap=c.overlap * pace, dt=c.dt, knot=c.knot * pace
         )
