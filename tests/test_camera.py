@@ -168,6 +168,8 @@ def test_stage_with_a_given_field_of_view():
     assert out.json["report.json"]["focal_source"] == "given"
     with pytest.raises(UsageError, match=r"camera\.fov_deg"):
         run_camera(stage_inputs(frames), CameraConfig(fov_deg=180.0), Silent())
+    with pytest.raises(UsageError, match="'drft'"):
+        run_camera(stage_inputs(frames), CameraConfig(quality="drft"), Silent())
 
 
 @pytest.mark.slow

@@ -246,6 +246,8 @@ def test_choice_of_segmenter(tmp_path):
     frames, _ = moving_disc(10)
     with pytest.raises(UsageError, match=r"auto, u2netp, still, motion, user"):
         run_masks(inputs(frames), MasksConfig(segmenter="sam"), Silent())
+    with pytest.raises(UsageError, match=r"'drft'.*draft, normal, high"):
+        run_masks(inputs(frames), MasksConfig(quality="drft"), Silent())
     with pytest.raises(UsageError, match="SLOMO_U2NETP"):
         run_masks(inputs(frames), MasksConfig(segmenter="u2netp"), Silent())
     with pytest.raises(UsageError, match="--masks"):

@@ -79,7 +79,7 @@ def reconstruct_structure(
     Args:
         frames: (T, H, W, 3) uint8 RGB.  masks: (T, H, W) bool, left out.
         focal: px, start, kept when not `refine_focal`.  features: per frame.  overlap: frames matched with each.
-        threads: of COLMAP; with more than one, each run gives slightly other numbers.
+        threads: of COLMAP after its features; with more than one, each run gives slightly other numbers.
         path: (N, 4, 4) cameras of `keys` that are known but for a little; without, they are found.
         waiting: called twice a second with the seconds that it has taken; what it raises ends the process.
 

@@ -15,7 +15,7 @@ from slomo.stage import Artifact, Inputs, Progress
 DECODE_VERSION = 2
 MASKS_VERSION = 7
 CAMERA_VERSION = 6
-DRAFT = "draft"
+QUALITIES = ("draft", "normal", "high")
 
 SEGMENTERS = ("auto", "u2netp", "still", "motion", "user")
 _LOST = 0.05  # part of the frames without the subject, from which on the other masks are taken
@@ -185,12 +185,13 @@ def run_camera(inputs: Inputs, config: CameraConfig, progress: Progress) -> Arti
         value = getattr(config, name)
         if not (0 < value < 170 or (value == 0 and name == "fov_deg")):
             raise UsageError(f"is {value}", where=f"camera.{name}", valid=["more than 0 and less than 170 degrees"])
+    every = 6 if _draft("camera", config.quality) else 3
     focal, share, source = _focal(config, decoded.json["video.json"].get("focal_px_hint", 0.0), frames.shape[1:3])
     settings = CameraSettings(
         focal=focal,
         focal_std=share * focal,
         refine_focal=not config.fov_deg,
-        key_every=config.key_every or (6 if config.quality == DRAFT else 3),
+        key_every=config.key_every or every,
         features=config.features,
         overlap=config.overlap,
         seed=config.seed,
@@ -198,6 +199,13 @@ def run_camera(inputs: Inputs, config: CameraConfig, progress: Progress) -> Arti
     path = estimate_camera(frames, masks, t, settings, progress)
     report = path.report | {"focal_source": "refined" if path.report["focal_observed"] else source}
     return Artifact(npz={"camera.npz": {"K": path.K, "T_world_cam": path.T_world_cam}}, json={"report.json": report})
+
+
+def _draft(stage: str, quality: str) -> bool:
+    """Whether a stage works at draft quality. Raises `UsageError` for a quality that there is not."""
+    if quality not in QUALITIES:
+        raise UsageError(f"quality is {quality!r}", where=f"{stage}.quality", valid=QUALITIES)
+    return quality == "draft"
 
 
 def _focal(config: CameraConfig, hint: float, size: tuple[int, int]) -> tuple[float, float, str]:
@@ -249,7 +257,7 @@ def _segmented(segmenter, config: MasksConfig, choice, frames: np.ndarray, flow,
 
 def _segmenter(inputs: Inputs, config: MasksConfig, choice):
     """The segmenter that the configuration and the files at hand decide on."""
-    name = config.segmenter
+    name, every = config.segmenter, 4 if _draft("masks", config.quality) else 1
     if name not in SEGMENTERS:
         raise UsageError(f"unknown segmenter {name!r}", where="masks.segmenter", valid=SEGMENTERS)
     if name == "auto":
@@ -272,8 +280,8 @@ def _segmenter(inputs: Inputs, config: MasksConfig, choice):
                 where="masks.segmenter",
                 todo=f"set {WEIGHTS_VARIABLE} to their path, or use --segmenter motion",
             )
-        every = config.network_every or (4 if config.quality == DRAFT else 1)
-        return SaliencySegmenter(U2Net(inputs.files["weights"]), choice, every=max(1, every))
+        every = max(1, config.network_every or every)
+        return SaliencySegmenter(U2Net(inputs.files["weights"]), choice, every=every)
     if name == "still":
         from slomo.reconstruct.still_segment import StillSegmenter
 
