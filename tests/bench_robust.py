@@ -29,6 +29,7 @@ from slomo.cli.session import Session
 from slomo.formats import load_keypoints
 from slomo.prior import stage as prior_stage
 from slomo.reconstruct import fit_stage, refine_stage
+from slomo.reconstruct.subject_flow import closer
 from slomo.stage import Artifact, Inputs, Silent
 from slomo.synth.score import score
 
@@ -72,7 +73,8 @@ def spoiled_masks(inputs: Inputs, rng: np.random.Generator) -> Inputs:
     both, either = (worse & full).sum((1, 2)), np.maximum((worse | full).sum((1, 2)), 1)
     print(f"  masks: IoU with the estimated ones {np.mean(both / either):.2f}", flush=True)
     packed = dict(z) | {"packed": np.packbits(worse, axis=-1)}
-    npz = {"masks.npz": packed, "flow.npz": masks.npz["flow.npz"]}
+    frames = inputs.artifacts["decode"].npz["frames.npz"]["frames"]
+    npz = {"masks.npz": packed, "flow.npz": masks.npz["flow.npz"] | closer(frames, worse.astype(bool))}
     return replace(inputs, artifacts={**inputs.artifacts, "masks": replace(masks, npz=npz)})
 
 

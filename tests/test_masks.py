@@ -1,4 +1,4 @@
-"""Masks: the user's own, the motion segmenter on clips with known answers, flow, and the errors."""
+"""Masks: the user's own, the motion segmenter on clips with known answers, and the errors."""
 
 from pathlib import Path
 
@@ -9,8 +9,9 @@ import pytest
 from slomo.errors import InvalidData, UsageError
 from slomo.reconstruct.flow import dense_flow
 from slomo.reconstruct.motion_segment import border_distance
-from slomo.reconstruct.segment import blend_over_time, component_at, frame_certainty, frame_quality, spans
+from slomo.reconstruct.segment import component_at, frame_certainty, frame_quality, spans
 from slomo.reconstruct.stage import DecodeConfig, MasksConfig, pack, run_decode, run_masks, unpack
+from slomo.reconstruct.still_segment import StillSegmenter
 from slomo.reconstruct.surroundings import give_back_patches
 from slomo.reconstruct.votes import vote_over_time
 from slomo.stage import Artifact, Inputs, Silent
@@ -51,26 +52,6 @@ def moving_disc(T: int = 24, *, speed: float = 2.0, camera: float = 1.0) -> tupl
 def inputs(frames: np.ndarray, **files) -> Inputs:
     decoded = Artifact(npz={"frames.npz": {"frames": frames, "t": np.arange(len(frames)) / 30}})
     return Inputs(artifacts={"decode": decoded}, files=files)
-
-
-def test_flow_of_a_shift():
-    image = np.uint8(noise(100, 160, 2))
-    flow = dense_flow(np.array([image[10:90, 20:140], image[12:92, 17:137]]))
-    middle = flow.forward[0, 20:60, 20:100].astype(float)
-    np.testing.assert_allclose(np.median(middle, axis=(0, 1)), [3, -2], atol=0.1)
-    np.testing.assert_allclose(np.median(flow.backward[0, 20:60, 20:100].astype(float), axis=(0, 1)), [-3, 2], atol=0.1)
-    assert flow.consistent[0, 20:60, 20:100].mean() > 0.95
-
-
-def test_chained_flow_and_the_frames_between():
-    frames, masks = moving_disc(8)
-    flow = dense_flow(frames)
-    inner = cv2.erode(masks[6].astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
-    np.testing.assert_allclose(np.median(flow.chain(6, 0)[inner], axis=0), [-12, 0], atol=0.04 * 12)
-    np.testing.assert_allclose(np.median(flow.chain(0, 6)[np.roll(inner, -12, 1)], axis=0), [12, 0], atol=0.04 * 12)
-    layers = {t: masks[t].astype(np.float32) for t in (0, 2, 4, 6, 7)}
-    filled = np.stack([*blend_over_time(layers, flow, lambda f: None, neighbours=1)])
-    assert iou(filled > 0.5, masks).min() > 0.9
 
 
 def test_votes_find_what_single_frames_miss_and_stop_at_another_colour():
@@ -210,6 +191,18 @@ def test_still_segmenter_finds_what_a_network_would_miss():
     rests = np.uint8(np.clip(frames[:1] + rng.normal(0, 3, frames.shape), 0, 255))
     with pytest.raises(InvalidData, match="nothing"):
         run_masks(inputs(rests), MasksConfig(segmenter="still"), Silent())
+
+
+def test_still_segmenter_keeps_a_foot_whose_leg_looks_like_the_ground():
+    frames, masks = moving_disc(40, speed=3.0, camera=0.0)
+    foot = np.zeros_like(masks)
+    for t in range(40):
+        x = round(60 + 3.0 * t)
+        foot[t, 88:97, x : x + 8] = True  # 8 px below the ellipse
+    frames[foot] = 255
+    found = StillSegmenter().segment(frames, dense_flow(frames), lambda f: None).masks
+    assert (found & foot).sum() > 0.8 * foot.sum()
+    assert iou(found, masks | foot)[foot.any((1, 2))].min() > 0.8
 
 
 def test_clip_without_a_subject():

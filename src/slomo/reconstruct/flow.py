@@ -55,7 +55,7 @@ def dense_flow(frames: np.ndarray, progress=lambda fraction: None) -> Flow:
         a, b = (cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames[t : t + 2])
         there, back = dis.calc(a, b, None), dis.calc(b, a, None)  # type: ignore[call-overload]
         forward[t], backward[t] = (cv2.resize(f, cells, interpolation=cv2.INTER_AREA) for f in (there, back))
-        home = _consistent(there, back).astype(np.float32)
+        home = consistent_px(there, back).astype(np.float32)
         consistent[t] = cv2.resize(home, cells, interpolation=cv2.INTER_AREA) > 0.5
 
     for t, _ in enumerate(in_order(both_ways, range(shape[0]))):
@@ -63,11 +63,14 @@ def dense_flow(frames: np.ndarray, progress=lambda fraction: None) -> Flow:
     return Flow(forward, backward, consistent, (width, height))
 
 
-def _consistent(there: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """Forward-backward check with the bound of Sundaram, Brox and Keutzer (ECCV 2010), equation 5."""
+def consistent_px(there: np.ndarray, back: np.ndarray, zoom: float = 1.0) -> np.ndarray:
+    """(H, W) bool. Forward-backward check with the bound of Sundaram, Brox and Keutzer (ECCV 2010), equation 5.
+
+    Its constant is in pixels of a picture that was not magnified by `zoom`.
+    """
     home = sample(back, there)
     error = np.sum((there + home) ** 2, axis=-1)
-    return error < 0.01 * (np.sum(there**2, axis=-1) + np.sum(home**2, axis=-1)) + 0.5
+    return error < 0.01 * (np.sum(there**2, axis=-1) + np.sum(home**2, axis=-1)) + 0.5 * zoom**2
 
 
 def sample(image: np.ndarray, offset: np.ndarray) -> np.ndarray:

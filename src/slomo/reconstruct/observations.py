@@ -16,6 +16,7 @@ from slomo.ground_path import mask_box
 from slomo.pinhole import Intrinsics, ground_points
 from slomo.prior.frames import every, spread
 from slomo.reconstruct.steady import steadied
+from slomo.reconstruct.subject_flow import merged
 
 Array = np.ndarray
 Tensor = torch.Tensor
@@ -157,18 +158,18 @@ def _cumulative(weights: Iterable[Array]) -> Tensor:
 
 def _chain(flow: Mapping[str, Array], first: int, last: int, size: tuple[int, int]) -> tuple[Array, Array]:
     """Flow between two frames, (H, W, 2) and whether it is sure (H, W): pixels are carried through those between."""
-    cells = flow["flow"].shape[2]
 
-    def sure(k: int) -> Array:
-        consistent = np.unpackbits(flow["consistent"][k], axis=-1)[:, :cells].astype(np.float32)
-        return cv2.resize(consistent, size, interpolation=cv2.INTER_NEAREST)
+    def at(k: int) -> tuple[Array, Array]:
+        field, home = merged(flow, k)
+        return spread(field, size), cv2.resize(home.astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
 
-    total, ok = spread(flow["flow"][first], size), sure(first)
+    total, ok = at(first)
     grid = np.stack(np.meshgrid(np.arange(size[0]), np.arange(size[1])), -1).astype(np.float32)
     for k in range(first + 1, last):
         at_k = grid + total
-        total = total + _at(spread(flow["flow"][k], size), at_k)
-        ok = ok * _at(sure(k), at_k)
+        step, sure = at(k)
+        total = total + _at(step, at_k)
+        ok = ok * _at(sure, at_k)
     return total, ok > 0.5
 
 

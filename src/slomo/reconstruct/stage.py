@@ -13,7 +13,7 @@ from slomo.reconstruct.video import decode
 from slomo.stage import Artifact, Inputs, Progress
 
 DECODE_VERSION = 2
-MASKS_VERSION = 7
+MASKS_VERSION = 8
 CAMERA_VERSION = 6
 QUALITIES = ("draft", "normal", "high")
 
@@ -134,6 +134,7 @@ def run_masks(inputs: Inputs, config: MasksConfig, progress: Progress) -> Artifa
     from slomo.reconstruct.flow import dense_flow
     from slomo.reconstruct.instances import choose
     from slomo.reconstruct.segment import frame_quality, spans
+    from slomo.reconstruct.subject_flow import closer
 
     decoded = inputs.artifacts["decode"]
     frames = decoded.npz["frames.npz"]["frames"]
@@ -144,6 +145,7 @@ def run_masks(inputs: Inputs, config: MasksConfig, progress: Progress) -> Artifa
     progress.note(f"masks: segmenter {segmenter.name}")
     quality = frame_quality(found.masks, flow, found.certainty)
     seen = np.asarray(found.masks.any((1, 2)))
+    own = closer(frames, found.masks, lambda f: progress.update(0.95 + 0.05 * f, "the subject's optical flow"))
     report = {
         "segmenter": segmenter.name,
         "quality_mean": float(quality[seen].mean()),
@@ -163,7 +165,7 @@ def run_masks(inputs: Inputs, config: MasksConfig, progress: Progress) -> Artifa
     return Artifact(
         npz={
             "masks.npz": {**pack(found.masks), "quality": quality.astype(np.float32)},
-            "flow.npz": {"flow": flow.forward, "consistent": pack(flow.consistent)["packed"]},
+            "flow.npz": {"flow": flow.forward, "consistent": pack(flow.consistent)["packed"], **own},
         },
         json={"report.json": report},
     )

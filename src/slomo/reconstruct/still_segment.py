@@ -30,6 +30,7 @@ _NOISE = 4.0  # levels of RGB that compression leaves
 _SOFT_PX = 0.8  # of the smoothing before frames are compared
 _SEEN = 0.6  # of the time, for which the subject may cover a place whose background is known
 _LEAST = 0.0015  # of the picture, a subject
+_SURELY = 2.0  # log odds, of what belongs to the subject though nothing joins it
 
 
 def stands_still(flow: Flow) -> bool:
@@ -78,6 +79,7 @@ class StillSegmenter:
         masks, certainty = np.empty(frames.shape[:3], bool), np.zeros(T)
         for t, p in enumerate(blend_over_time(body, flow, lambda f: None, neighbours=1)):
             masks[t] = component_at(p > 0.45, body[t] if body[t].any() else None, reach=_reach(p > 0.5))
+            masks[t] |= _parts(p > 0.45, body[t])
             certainty[t] = frame_certainty(p, masks[t])
         return Masks(masks, certainty, {"chosen": self.choice.how})
 
@@ -130,8 +132,21 @@ def _refined(frame: np.ndarray, differs: np.ndarray, body: np.ndarray, model) ->
     """Silhouette (H, W) bool near where it was, from the difference and the colours."""
     if not body.any():
         return body
-    near = grown(body, 0.25)
+    near = grown(body, 0.3)
     colour = cv2.GaussianBlur(model(to_lab(frame)), (0, 0), 0.8)
     logit = 1.5 * differs + 0.5 * np.clip(colour, -2.5, 2.5) - 0.3
     probability = np.where(near, 1 / (1 + np.exp(-logit)), 0.0)
-    return component_at(probability > 0.5, body, reach=_reach(body))
+    whole = component_at(probability > 0.5, body, reach=_reach(body))
+    # A dark leg on dark ground leaves the foot alone: what surely differs, nearer than a leg is long, belongs to it.
+    sure = _parts(differs > _SURELY, near)
+    return whole | sure if whole.any() else whole
+
+
+def _parts(mask: np.ndarray, body: np.ndarray) -> np.ndarray:
+    """The components of `mask` of which more than half lies in `body`, and that are no specks beside it."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    area = stats[:, cv2.CC_STAT_AREA]
+    keep = np.bincount(labels[body & mask], minlength=count) > 0.5 * area
+    keep &= area > max(4, 0.002 * body.sum())
+    keep[0] = False
+    return np.isin(labels, np.flatnonzero(keep))
