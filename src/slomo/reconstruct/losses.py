@@ -17,7 +17,7 @@ from slomo.reconstruct.silhouette import Outline
 Tensor = torch.Tensor
 
 SOFT_PX = 0.7  # width of the silhouette's edge and of the smooth minimum over capsules, working pixels
-SWING = 3.0  # accelerations of a gait's nodes in units of speed squared over body length
+SWING = 5.0  # accelerations of a gait's nodes in units of speed squared over body length
 SLIDE = 0.75  # body lengths / s of a standing foot: the unit of its drift
 # Masks lose tails in some frames and find them in others. A tail that was pushed out of all the background where it is
 # missed would hide behind the body for good; these are what it costs there, against any other part.
