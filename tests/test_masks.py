@@ -205,6 +205,18 @@ def test_still_segmenter_keeps_a_foot_whose_leg_looks_like_the_ground():
     assert iou(found, masks | foot)[foot.any((1, 2))].min() > 0.8
 
 
+def test_still_segmenter_leaves_out_a_small_companion():
+    frames, masks = moving_disc(40, speed=3.0, camera=0.0)
+    young = np.zeros_like(masks)
+    y, x = np.mgrid[: masks.shape[1], : masks.shape[2]]
+    for t in range(40):
+        young[t] = ((x - 60 - 3.0 * t) / 14) ** 2 + ((y - 96) / 10) ** 2 < 1  # 6 px below the ellipse
+    frames[young] = [230, 230, 60]
+    found = StillSegmenter().segment(frames, dense_flow(frames), lambda f: None).masks
+    assert (found & young).sum() < 0.1 * young.sum()
+    assert iou(found, masks).min() > 0.8
+
+
 def test_clip_without_a_subject():
     frames = np.repeat(np.uint8(noise(120, 200, 3))[None], 10, 0)
     with pytest.raises(InvalidData, match="no subject found") as caught:

@@ -143,10 +143,11 @@ def _refined(frame: np.ndarray, differs: np.ndarray, body: np.ndarray, model) ->
 
 
 def _parts(mask: np.ndarray, body: np.ndarray) -> np.ndarray:
-    """The components of `mask` of which more than half lies in `body`, and that are no specks beside it."""
+    """The components of `mask` of which more than half lies in `body`, and that are neither specks beside it nor as
+    large as another animal."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     area = stats[:, cv2.CC_STAT_AREA]
     keep = np.bincount(labels[body & mask], minlength=count) > 0.5 * area
-    keep &= area > max(4, 0.002 * body.sum())
+    keep &= (area > max(4, 0.002 * body.sum())) & (area < 0.15 * body.sum())
     keep[0] = False
     return np.isin(labels, np.flatnonzero(keep))
