@@ -221,6 +221,18 @@ def test_a_wrong_slomo_toml(project, text, message):
     assert (project / "slomo.toml").read_text().startswith(text)
 
 
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        (".5", 0.5), ("-.5e-1", -0.05), ("2.", 2.0), ("2", 2), ("[1, 2]", [1, 2]), ("true", True), ("'.5'", ".5"),
+        ("walk.mp4", "walk.mp4"), (".hidden", ".hidden"), ("", None),
+    ],
+)  # fmt: skip
+def test_values_of_set(text, value):
+    section, name, found = settings.parse_set(f"decode.start={text}")
+    assert (section, name, found, type(found)) == ("decode", "start", value, type(value))
+
+
 def test_wrong_set_options_leave_the_file_alone(project):
     run("reconstruct", "clip.txt")
     before = (project / "slomo.toml").read_text()

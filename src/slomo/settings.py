@@ -137,13 +137,18 @@ def toml_value(x: Any) -> str:
 
 
 def parse_set(text: str) -> tuple[str, str, Any]:
-    """(section, name, value) of `--set section.name=value`. The value is TOML, or a bare word. Empty: remove it."""
+    """(section, name, value) of `--set section.name=value`. Empty: remove it.
+
+    The value is TOML, a number as people write it (".5"), or a bare word.
+    """
     m = re.fullmatch(r"\s*(\w+)\.(\w+)\s*=(.*)", text, re.DOTALL)
     if not m:
         raise UsageError(f"{text!r} is not section.name=value", where="--set", todo="for example camera.fov=60")
     section, name, value = m[1], m[2], m[3].strip()
     if not value:
         return section, name, None
+    if re.fullmatch(r"[+-]?(\.\d+|\d+\.)([eE][+-]?\d+)?", value):
+        return section, name, float(value)
     try:
         return section, name, tomllib.loads(f"x = {value}")["x"]
     except tomllib.TOMLDecodeError:
