@@ -11,7 +11,7 @@ from slomo.reconstruct.run import from_arrays
 from slomo.stage import Artifact, Inputs, Silent
 from test_fit import FPS, Stops, T, _inputs, _walk
 
-CONFIG = ReconstructConfig(quality="draft", iterations=(4, 3, 3, 6), candidates=3, gait_phases=2, fps=6)
+CONFIG = ReconstructConfig(quality="draft", iterations=(4, 3, 3, 4, 2), candidates=3, gait_phases=2, fps=6)
 
 
 @pytest.fixture

@@ -23,8 +23,8 @@ from slomo.stage import Artifact, Inputs, Progress, Silent
 
 T, FPS, LENGTH = 24, 12.0, 0.45
 K = Intrinsics(150, 150, 79.5, 44.5, 160, 90)
-QUICK = ReconstructConfig(quality="draft", iterations=(40, 40, 20, 120), candidates=4, gait_phases=6, fps=12)
-TINY = ReconstructConfig(quality="draft", iterations=(6, 4, 4, 6), candidates=3, gait_phases=2, fps=6)
+QUICK = ReconstructConfig(quality="draft", iterations=(40, 40, 20, 90, 30), candidates=4, gait_phases=6, fps=12)
+TINY = ReconstructConfig(quality="draft", iterations=(6, 4, 4, 4, 2), candidates=3, gait_phases=2, fps=6)
 
 
 @pytest.fixture(scope="module", autouse=True)

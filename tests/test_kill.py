@@ -37,7 +37,7 @@ duration = 1.5
 [masks]
 segmenter = "motion"
 [reconstruct]
-iterations = [20, 10, 10, 60]
+iterations = [20, 10, 10, 45, 15]
 gait_phases = 4
 candidates = 3
 """

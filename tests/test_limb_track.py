@@ -17,11 +17,11 @@ UP = slice(8, 17)  # frames with a raised paw
 RAISED = {"shoulder": -40.0, "elbow": -85.0}
 
 
-def standing(side: str | None):
+def standing(side: str | None, raised: dict[str, float] = RAISED):
     """A dog that stands and raises its front paw of that side for a second: the problem, and the root's guess."""
     kin = Kinematics(load_skeleton("quadruped"))
     q = np.zeros((T, kin.B, 3))
-    for joint, degrees in RAISED.items() if side else ():
+    for joint, degrees in raised.items() if side else ():
         q[UP, kin.skeleton.names.index(f"front_{side}_{joint}"), 1] = np.radians(degrees)
     return problem_of(np.zeros(T), q, skeleton="quadruped", centre=CENTRE)
 
@@ -43,7 +43,7 @@ def paws(problem, x, guess) -> np.ndarray:
 def test_a_raised_paw_is_found_while_it_is_raised():
     problem, root = standing("right")
     x, guess = at_rest(problem, root)
-    found = limb_track.by_limb(problem, x, guess)
+    found = limb_track.by_limb(problem, x, guess, leave=limb_track.PLAINLY)
     assert found is not None
     height = paws(problem, *found) - paws(problem, x, guess)
     names = [limb.name for limb in problem.kin.skeleton.limbs]
@@ -52,6 +52,19 @@ def test_a_raised_paw_is_found_while_it_is_raised():
     assert front[10:15].min(1).max() < 0.05  # one of the two: a silhouette does not tell which
     assert np.abs(height[[0, 1, 2, 3, -4, -3, -2, -1]]).max() < 0.05
     assert np.abs(height[:, [n for n, name in enumerate(names) if "hind" in name]]).max() < 0.05
+
+
+def test_a_folded_wrist_leaves_the_joints_above_it_where_they_are():
+    problem, root = standing("right", {"wrist": 100.0})
+    x, guess = at_rest(problem, root)
+    found = limb_track.by_limb(problem, x, guess, leave=limb_track.LIKELY)
+    assert found is not None
+    turned = np.degrees(np.abs(found[1].q[0, :, :, 1].numpy()))
+    names = problem.kin.skeleton.names
+    wrists = turned[:, [names.index(f"front_{side}_wrist") for side in ("left", "right")]]
+    assert wrists[10:15].max(1).min() > 60
+    assert wrists[[0, 1, 2, -3, -2, -1]].max() < 5
+    assert turned[:, [names.index(f"front_{s}_{j}") for s in ("left", "right") for j in RAISED]].max() < 5
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
@@ -72,7 +85,7 @@ def test_key_points_tell_which_paw_it_is(side):
         keypoint_confidence=np.full(uv.shape[:2], 0.8), keypoint_side=np.full(4, 0.9),
     )  # fmt: skip
     problem = replace(problem, said=gather(arrays, problem.obs, problem.kin.skeleton))
-    found = limb_track.by_limb(problem, x, guess)
+    found = limb_track.by_limb(problem, x, guess, leave=limb_track.PLAINLY)
     assert found is not None
     height = paws(problem, *found) - paws(problem, x, guess)
     which = [limb.name for limb in problem.kin.skeleton.limbs].index(f"front_{side}")
@@ -82,4 +95,4 @@ def test_key_points_tell_which_paw_it_is(side):
 
 def test_limbs_that_are_where_they_are_seen_stay_there():
     problem, root = standing(None)
-    assert limb_track.by_limb(problem, *at_rest(problem, root)) is None
+    assert limb_track.by_limb(problem, *at_rest(problem, root), leave=limb_track.LIKELY) is None

@@ -69,7 +69,7 @@ def test_clip_becomes_key_points_in_metres(tmp_path):
     """A short part of the embedded clip, with far fewer iterations than the default: the files, not the accuracy."""
     slomo(
         tmp_path, "reconstruct", str(ASSET / "clip.mp4"), "--segmenter", "motion", "--duration", "1.2",
-        "--set", "reconstruct.iterations=[20, 10, 10, 60]", "--set", "reconstruct.gait_phases=4",
+        "--set", "reconstruct.iterations=[20, 10, 10, 45, 15]", "--set", "reconstruct.gait_phases=4",
         "--set", "reconstruct.candidates=3",
     )  # fmt: skip
     z = np.load(artifact(tmp_path, "reconstruct") / "keypoints.npz")

@@ -132,14 +132,14 @@ def join(whole: Problem, paths: Sequence[Trajectory], runs: Sequence[Run], where
         weight[first:last] += inner
         yaw_before = np.full(T, np.nan)
         yaw_before[first:last] = yaw
-        loss = run.log["final"][0]["loss"]
+        loss = run.loss
         log["chunks"].append({"start_s": round(float(whole.obs.t[first]), 3), "loss": loss, **run.labels[0]})
     mean = {k: x / weight.reshape(-1, *[1] * (x.ndim - 1)) for k, x in total.items()}
     stance = torch.full((1, T, runs[0].guess.stance.shape[2]), -1.0)
     guess = Guess(stance=stance, **{k: torch.as_tensor(x, dtype=torch.float32)[None] for k, x in mean.items()})
     x = whole.variables(1, torch.Generator().manual_seed(0))
     x |= {k: torch.stack([r.x[k] for r in runs]).mean(0) for k in x if k.startswith("shape.")}
-    best = min(runs, key=lambda r: r.log["final"][0]["loss"])
+    best = min(runs, key=lambda r: r.loss)
     return Run(best.phase, x, guess, [{**best.labels[0], "chunks": len(runs)}], best.log | log)
 
 

@@ -13,11 +13,10 @@ import torch
 
 from slomo.reconstruct.fields.config import FieldsConfig
 from slomo.reconstruct.fields.terms import Fields
-from slomo.reconstruct.fit import rank
 from slomo.reconstruct.physics import coupling
 from slomo.reconstruct.physics.coupling import Physics
 from slomo.reconstruct.physics.learn import PhysicsConfig
-from slomo.reconstruct.problem import Problem, Schedule, Variables, optimise
+from slomo.reconstruct.problem import Problem, Schedule, Variables, optimise, rank
 from slomo.reconstruct.run import Run, checkpoint, restore
 from slomo.stage import Progress
 

@@ -1,4 +1,5 @@
-"""The fit, coarse to fine: size and trunk with headings, then gaits with the legs, then the rivals, then the winner.
+"""The fit, coarse to fine: size and trunk with headings, then gaits with the legs, then the rivals, then the winner,
+and that once more beside one whose limbs are where they are seen better.
 
 Every phase is one `optimise` of a batch of hypotheses; between phases they are ranked by loss on fixed draws and the
 best go on. All of it is deterministic by the seed, and a checkpoint within any phase resumes to the same bits.
@@ -10,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from slomo.reconstruct import hypotheses, limb_track, pose_track
+from slomo.reconstruct import hypotheses, limb_track, pose_track, starts
 from slomo.reconstruct.hypotheses import GaitHypothesis, RootGuess
-from slomo.reconstruct.problem import Problem, Schedule, Variables, optimise
+from slomo.reconstruct.problem import Problem, Schedule, optimise, pick, rank
 from slomo.reconstruct.run import Run, checkpoint, join, restore
 from slomo.reconstruct.trajectory import Guess
 from slomo.stage import Progress
@@ -20,7 +21,8 @@ from slomo.stage import Progress
 Tensor = torch.Tensor
 
 TIE = 0.03  # a rival whose loss is higher by this share may still win in the end
-PHASES = ("heading", "gait", "rivals", "final")
+PHASES = ("heading", "gait", "rivals", "final", "limbs")
+FINAL = PHASES.index("final")  # from there on little is between two hypotheses, and many draws tell them apart
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ def fit(problem: Problem, root: RootGuess, effort: Effort, *, metres: float, see
     generator = torch.Generator().manual_seed(seed)
     run, start, adam_state = restore(progress.load(), generator)
     if run is None:
-        run = _start(problem, root, generator)
+        run = starts.start(problem, root, generator)
     total = total_cost(effort)
     while True:
         schedule = effort.schedules[run.phase]
@@ -58,16 +60,14 @@ def fit(problem: Problem, root: RootGuess, effort: Effort, *, metres: float, see
             problem, run.x, run.guess, schedule, generator, start=start, adam_state=adam_state, each=each
         )  # fmt: skip
         start, adam_state = 0, None
-        losses = rank(problem, run.x, run.guess)
+        losses = rank(problem, run.x, run.guess, draws=4 if run.phase < FINAL else 24)
         run.log[PHASES[run.phase]] = [
             label | {"loss": round(float(v), 4)} for label, v in zip(run.labels, losses, strict=True)
         ]
         if run.phase == len(PHASES) - 1:
-            order = losses.argsort()
-            run.log["final"] = [run.log["final"][int(k)] for k in order]
-            best = order[:1]
-            return Run(run.phase, _pick(run.x, best), run.guess.pick(best), [run.labels[int(best)]], run.log)
-        run = (_to_gait, _to_rivals, _to_final)[run.phase](problem, run, losses, root, effort, metres, progress)
+            return _winner(run, losses)
+        step = (_to_gait, _to_rivals, _to_final, _to_limbs)[run.phase]
+        run = step(problem, run, losses, root, effort, metres, progress)
 
 
 def polish(problem: Problem, run: Run, schedule: Schedule, *, seed: int, progress: Progress) -> Run:
@@ -93,85 +93,8 @@ def _cost(schedule: Schedule) -> float:
     return schedule.frames * schedule.pixels + 2000
 
 
-def _start(problem: Problem, root: RootGuess, generator: torch.Generator) -> Run:
-    """Every heading with the size and the posture that fit the masks best as they are: a raised tail or a lowered head
-    changes the height from which the size was guessed, and a raised tail looks like a neck."""
-    if problem.kin.skeleton.kind == "human":
-        return _start_tracked(problem, root, generator)
-    postures, posture_names = hypotheses.posture_angles(problem.kin)
-    n = len(postures)
-    tried: list[tuple[Tensor, list[Guess], list[dict]]] = []
-    sizes = (1.0, 0.8)
-    one = problem.variables(1, generator)
-    said = hypotheses.said_headings(problem.obs, problem.said, root)
-    for size in sizes:
-        scaled = replace(root, length=root.length * size)
-        guess, names = hypotheses.heading_guess(problem.kin, scaled, len(problem.obs.t), said)
-        x = _pick(one, torch.zeros(n, dtype=torch.long))
-        x["shape.log_length"] += math.log(scaled.length)
-        values, guesses, labels = [], [], []
-        for k, name in enumerate(names):
-            wide = guess.pick(torch.full((n,), k))
-            posed = replace(wide, q=wide.q + postures[:, None])
-            value = rank(problem, x, posed, draws=1, frames=12, pixels=128)
-            values.append(value.min())
-            guesses.append(posed.pick(value.argmin()[None]))
-            labels.append({"heading": name, "size": size, "posture": posture_names[int(value.argmin())]})
-        tried.append((torch.stack(values), guesses, labels))
-    best = torch.stack([v for v, _, _ in tried]).argmin(0).tolist()
-    x = _pick(one, torch.zeros(len(best), dtype=torch.long))
-    x["shape.log_length"] += torch.tensor([math.log(root.length * sizes[b]) for b in best])
-    return Run(0, x, join([tried[b][1][k] for k, b in enumerate(best)]), [tried[b][2][k] for k, b in enumerate(best)])
-
-
-def _start_tracked(problem: Problem, root: RootGuess, generator: torch.Generator) -> Run:
-    """Paths through headings and postures that suit the silhouettes best, mostly seen from the front and from behind,
-    one as the view is said to be, and one that faces the way of travel; each with two sizes."""
-    postures, posture_names = hypotheses.posture_angles(problem.kin)
-    one = problem.variables(1, generator)
-    T, ring = len(problem.obs.t), tuple(2 * math.pi * n / pose_track.HEADINGS for n in range(pose_track.HEADINGS))
-    guesses, labels, lengths = [], [], []
-    for size in (1.0, 0.85):
-        scaled = replace(root, length=root.length * size)
-        x = _pick(one, torch.zeros(1, dtype=torch.long))
-        x["shape.log_length"] += math.log(scaled.length)
-        any_way = hypotheses.placed(problem.kin, scaled, np.zeros((1, T)))
-        views: dict[str, pose_track.View] = {"front": pose_track.AWAY, "back": -pose_track.AWAY}
-        if problem.said and "view" in problem.said.groups:
-            views["view"] = problem.said
-        found = pose_track.tracks(problem, x, any_way, scaled, postures, turns=ring, views=tuple(views.values()))
-        kinds = list(views)
-        if root.travelled > 0.7:
-            travel = hypotheses.placed(problem.kin, scaled, root.heading[None])
-            found += pose_track.tracks(problem, x, travel, scaled, postures)
-            kinds += ["travel"]
-        for kind, track in zip(kinds, found, strict=True):
-            guess = hypotheses.placed(problem.kin, scaled, track.yaw[None])
-            guesses.append(replace(guess, q=torch.as_tensor(track.q, dtype=torch.float32)[None]))
-            posture = posture_names[int(track.postures.argmax())]
-            labels.append({"heading": f"tracked, {kind}", "size": size, "posture": posture})
-            lengths.append(math.log(scaled.length))
-    x = _pick(one, torch.zeros(len(guesses), dtype=torch.long))
-    x["shape.log_length"] += torch.tensor(lengths)
-    return Run(0, x, join(guesses), labels)
-
-
 def total_cost(effort: Effort) -> float:
     return sum(s.iterations * _cost(s) for s in effort.schedules)
-
-
-def rank(
-    problem: Problem, x: Variables, guess: Guess, *, draws: int = 4, frames: int = 32, pixels: int = 256
-) -> Tensor:
-    """(H,) loss on draws that are the same for every call."""
-    generator = torch.Generator().manual_seed(7)
-    with torch.no_grad():
-        parts = [problem.loss(x, guess, problem.draw(frames, pixels, generator))[0] for _ in range(draws)]
-    return torch.stack(parts).mean(0)
-
-
-def _pick(x: Variables, which: Tensor) -> Variables:
-    return {k: v[which].clone() for k, v in x.items()}
 
 
 def _to_gait(
@@ -197,13 +120,13 @@ def _to_gait(
         base = run.guess.pick(one)
         # In place of the posture it began with.
         if skeleton.kind == "human":
-            track = pose_track.tracks(problem, _pick(run.x, one), base, root, postures)[0]
+            track = pose_track.tracks(problem, pick(run.x, one), base, root, postures)[0]
             base = replace(base, q=torch.as_tensor(track.q, dtype=torch.float32)[None])
             best = int(track.postures.argmax())
         else:
             wide = base.pick(torch.zeros(len(postures), dtype=torch.long))
             guess = replace(wide, q=postures[:, None].expand(-1, wide.q.shape[1], -1, -1).contiguous())
-            value = rank(problem, _pick(run.x, one.expand(len(postures))), guess, draws=2, frames=12, pixels=200)
+            value = rank(problem, pick(run.x, one.expand(len(postures))), guess, draws=2, frames=12, pixels=200)
             base, best = guess.pick(value.argmin()[None]), int(value.argmin())
         run.labels[k] = run.labels[k] | {"posture": posture_names[best]}
         posed.append(base)
@@ -211,7 +134,7 @@ def _to_gait(
             chunk = grid[i : i + 24]
             poses = [hypotheses.gait_pose(kin, gaits[g.name], g, t, speed=root.speed, leg=leg) for g in chunk]
             guess = _lay(base, poses)
-            value = rank(problem, _pick(run.x, one.expand(len(chunk))), guess, draws=1, frames=16, pixels=128)
+            value = rank(problem, pick(run.x, one.expand(len(chunk))), guess, draws=1, frames=16, pixels=128)
             entries += [
                 (float(v), k, g, guess.pick(torch.tensor([n])))
                 for n, (v, g) in enumerate(zip(value, chunk, strict=True))
@@ -227,7 +150,7 @@ def _to_gait(
         run.labels[k] | {"gait": g.name, "stride_hz": round(g.frequency, 3), "phase": round(g.phase, 3)}
         for _, k, g, _ in chosen
     ]
-    return Run(1, _pick(run.x, which), join(guesses), labels, run.log)
+    return Run(1, pick(run.x, which), join(guesses), labels, run.log)
 
 
 def _lay(base: Guess, poses: list[tuple[np.ndarray, np.ndarray]]) -> Guess:
@@ -272,10 +195,10 @@ def _to_rivals(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
     other = [k for k in order if run.labels[k]["gait"] != run.labels[order[0]]["gait"]]
     which = torch.tensor(list(dict.fromkeys(order[:2] + other[:1])))
     best = which[:1]
-    x, guess = _pick(run.x, which), run.guess.pick(which)
-    more = {"exchanged": hypotheses.exchanged(problem, _pick(run.x, best), run.guess.pick(best))}
+    x, guess = pick(run.x, which), run.guess.pick(which)
+    more = {"exchanged": hypotheses.exchanged(problem, pick(run.x, best), run.guess.pick(best))}
     if problem.kin.skeleton.kind == "quadruped":
-        found = limb_track.by_limb(problem, _pick(run.x, best), run.guess.pick(best))
+        found = limb_track.by_limb(problem, pick(run.x, best), run.guess.pick(best), leave=limb_track.PLAINLY)
         if found is not None:
             more["on their own"] = found
     x = {k: torch.cat([v, *(other[k] for other, _ in more.values())]) for k, v in x.items()}
@@ -290,4 +213,26 @@ def _to_final(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
     own = run.labels[order[0]]
     other = [k for k in order if any(run.labels[k].get(w) != own.get(w) for w in ("gait", "legs"))]
     which = torch.tensor(order[:1] + [k for k in other[:1] if losses[k] < (1 + TIE) * losses[order[0]]])
-    return Run(3, _pick(run.x, which), run.guess.pick(which), [run.labels[int(k)] for k in which], run.log)
+    return Run(3, pick(run.x, which), run.guess.pick(which), [run.labels[int(k)] for k in which], run.log)
+
+
+def _to_limbs(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
+    """The best one goes on, beside it with limbs that are where they are seen better by now, where any are."""
+    best = _winner(run, losses)
+    found = None
+    if problem.kin.skeleton.kind == "quadruped":
+        found = limb_track.by_limb(problem, best.x, best.guess, leave=limb_track.LIKELY)
+    if found is None:
+        return replace(best, phase=run.phase + 1)
+    x = {k: torch.cat([v, found[0][k]]) for k, v in best.x.items()}
+    labels = [*best.labels, best.labels[0] | {"limbs": "on their own"}]
+    return Run(run.phase + 1, x, join([best.guess, found[1]]), labels, run.log)
+
+
+def _winner(run: Run, losses: Tensor) -> Run:
+    """The hypothesis of least loss; the log of the phase has them in the order of their losses."""
+    order = losses.argsort()
+    phase = PHASES[run.phase]
+    run.log[phase] = [run.log[phase][int(k)] for k in order]
+    best = order[:1]
+    return Run(run.phase, pick(run.x, best), run.guess.pick(best), [run.labels[int(best)]], run.log)

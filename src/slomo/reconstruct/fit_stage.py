@@ -21,12 +21,13 @@ from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import Skeleton, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 16
+FIT_VERSION = 17
 
+AGAIN = 0.5  # share of the rates with which the winner is fitted once more, beside one with other limbs
 POLISH = 0.4  # share of the rates with which the chunks of a long clip are polished together
 
-# Of the heading, gait, rivals and final phase.
-ITERATIONS = {"draft": (50, 50, 60, 120), "normal": (100, 120, 150, 400), "high": (150, 200, 300, 600)}
+# Of each of the fit's phases.
+ITERATIONS = {"draft": (50, 50, 60, 90, 30), "normal": (100, 120, 150, 300, 100), "high": (150, 200, 300, 450, 150)}
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class FitConfig:
         fps: fit frames a second at most. subject_px: size of the subject in working pixels (root of its area).
         width: neurons of the hidden layers of Q and G. joint_hz, root_hz: highest frequency of their time features.
         quality: draft, normal or high: how long it works on it.
-        iterations: of the heading, gait, rivals and final phase; none: as the quality says.
+        iterations: of the heading, gait, rivals, final and limbs phase; none: as the quality says.
         candidates: hypotheses that are fitted in the gait phase; gait_phases: phases tried of each gait.
         tilt_moving_deg, tilt_static_deg: s.d. of the given gravity for a camera that moved, and for one that did not.
         weight_*: of the evidence; 0 switches a term off. `facing` is for people only; `view`, `keypoints`, `parts` and
@@ -156,7 +157,7 @@ def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
     with one_thread():
         run = _search(made, config, progress) if len(where) == 1 else _long(inputs, made, where, config, progress)
     report: dict[str, Any] = {
-        "hypothesis": run.labels[0], "loss": run.log["final"][0]["loss"], "search": run.log,
+        "hypothesis": run.labels[0], "loss": run.loss, "search": run.log,
         "skeleton": made.skeleton.name, "camera_mode": made.camera_mode, "evidence": made.evidence,
         "seconds": round(time.perf_counter() - began, 1), "cpu_seconds": round(time.process_time() - cpu, 1),
     }  # fmt: skip
@@ -180,7 +181,7 @@ def _long(
         runs.append(_search(part, config, chunks.ChunkProgress(progress, runs, len(where))))
     paths = [_path(made.problem.obs.t[a:b], made.problem.kin, config) for a, b in where]
     joined = chunks.join(made.problem, paths, runs, where)
-    schedule = replace(_effort(config).schedules[-1], rate=POLISH)
+    schedule = replace(_effort(config).schedules[fitting.FINAL], rate=POLISH)
     last = chunks.ChunkProgress(progress, runs, len(where))
     return fitting.polish(made.problem, joined, schedule, seed=config.seed, progress=last)
 
@@ -207,7 +208,7 @@ def one_thread() -> Iterator[None]:
 
 
 def _effort(config: FitConfig) -> fitting.Effort:
-    heading, gait, rivals, final = config.iterations or ITERATIONS[config.quality]
+    heading, gait, rivals, final, limbs = config.iterations or ITERATIONS[config.quality]
     skeleton = tuple(f"shape.{k}" for k in ("log_length", "group", "node", "shift", "radius", "girth"))
     return fitting.Effort(
         schedules=(
@@ -215,6 +216,7 @@ def _effort(config: FitConfig) -> fitting.Effort:
             Schedule(gait, 16, 160, (*skeleton, "Q", "G", "tilt"), stance=1.0),
             Schedule(rivals, 32, 200, (*skeleton, "Q", "G", "tilt"), stance=0.0),
             Schedule(final, 48, 300, (*skeleton, "Q", "G", "tilt"), late=("shape.flesh",)),
+            Schedule(limbs, 48, 300, (*skeleton, "shape.flesh", "Q", "G", "tilt"), rate=AGAIN),
         ),
         candidates=config.candidates,
         phases_of_gait=config.gait_phases,

@@ -53,11 +53,13 @@ def frame_costs(problem: Problem, x: Variables, guess: Guess, seen: Tensor) -> A
 
 
 def viterbi(cost: Array, step: Array) -> Array:
-    """(S,) the states of the cheapest path. cost (S, N) of each state; step (N, N) from a state (row) to the next."""
+    """(S,) the states of the cheapest path. cost (S, N) of each state; step (N, N), or (S - 1, N, N) where it changes
+    over time, from a state (row) to the next."""
     back = np.zeros(cost.shape, int)
     total = cost[0]
+    steps = np.broadcast_to(step, (len(cost) - 1, *step.shape[-2:]))
     for k in range(1, len(cost)):
-        via = total[:, None] + step
+        via = total[:, None] + steps[k - 1]
         back[k] = via.argmin(0)
         total = via.min(0) + cost[k]
     path = [int(total.argmin())]

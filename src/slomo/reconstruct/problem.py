@@ -107,6 +107,21 @@ def _found(cumulative: Tensor, rows: Tensor, r: Tensor) -> Tensor:
     return torch.stack([torch.searchsorted(cumulative[k], x) for k, x in zip(rows.tolist(), r, strict=True)])
 
 
+def rank(
+    problem: Problem, x: Variables, guess: Guess, *, draws: int = 4, frames: int = 32, pixels: int = 256
+) -> Tensor:
+    """(H,) loss on draws that are the same for every call."""
+    generator = torch.Generator().manual_seed(7)
+    with torch.no_grad():
+        parts = [problem.loss(x, guess, problem.draw(frames, pixels, generator))[0] for _ in range(draws)]
+    return torch.stack(parts).mean(0)
+
+
+def pick(x: Variables, which: Tensor) -> Variables:
+    """The variables of some hypotheses."""
+    return {k: v[which].clone() for k, v in x.items()}
+
+
 LATE = 0.3  # the part of a phase in which the late variables change
 RATES = {"shape.log_length": 4e-3, "shape": 3e-2, "tilt": 2e-2, "Q": 4e-3, "G": 2e-3, "F": 4e-3, "F.background": 1e-2}
 

@@ -29,6 +29,11 @@ class Run:
     labels: list[dict]
     log: dict = field(default_factory=dict)
 
+    @property
+    def loss(self) -> float:
+        """Of the winner, once there is one."""
+        return self.log["limbs"][0]["loss"]
+
 
 def as_arrays(run: Run) -> dict[str, np.ndarray]:
     """Everything of a run, as an artifact or a checkpoint holds it."""
