@@ -22,7 +22,7 @@ SMALL = Plan(
     PhysicsConfig(iterations=(3, 3), dt=0.005),
     appearance=6, joint=6, rounds=2, render=6,
 )  # fmt: skip
-CONFIG = ReconstructConfig(iterations=(6, 4, 4, 30), candidates=3, gait_phases=2, fps=6)
+CONFIG = ReconstructConfig(iterations=(6, 4, 4, 24, 6), candidates=3, gait_phases=2, fps=6)
 
 
 @pytest.fixture(scope="module")
