@@ -216,11 +216,12 @@ def _to_final(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
     return Run(3, pick(run.x, which), run.guess.pick(which), [run.labels[int(k)] for k in which], run.log)
 
 
-def _to_limbs(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
-    """The best one goes on, beside it with limbs that are where they are seen better by now, where any are."""
+def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, *_) -> Run:
+    """The best one goes on, beside it with limbs that are where they are seen better by now, where any are and there is
+    time for it."""
     best = _winner(run, losses)
     found = None
-    if problem.kin.skeleton.kind == "quadruped":
+    if problem.kin.skeleton.kind == "quadruped" and effort.schedules[-1].iterations:
         found = limb_track.by_limb(problem, best.x, best.guess, leave=limb_track.LIKELY)
     if found is None:
         return replace(best, phase=run.phase + 1)

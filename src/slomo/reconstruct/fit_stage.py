@@ -21,13 +21,13 @@ from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import Skeleton, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 17
+FIT_VERSION = 18
 
 AGAIN = 0.5  # share of the rates with which the winner is fitted once more, beside one with other limbs
 POLISH = 0.4  # share of the rates with which the chunks of a long clip are polished together
 
 # Of each of the fit's phases.
-ITERATIONS = {"draft": (50, 50, 60, 90, 30), "normal": (100, 120, 150, 300, 100), "high": (150, 200, 300, 450, 150)}
+ITERATIONS = {"draft": (50, 50, 60, 120, 0), "normal": (100, 120, 150, 300, 100), "high": (150, 200, 300, 450, 150)}
 
 
 @dataclass(frozen=True)
