@@ -1,6 +1,7 @@
 """The whole fit on a walk of the skeleton itself: it must find it, resume to the same bits, and say when it cannot."""
 
 import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -169,7 +170,18 @@ def test_an_interrupted_fit_resumes_to_the_same_bits(walk, saves: int):
     again = reconstruct(_inputs(masks, flow), TINY, Stops(99, first.saved))
     for k, v in whole.npz["keypoints.npz"].items():
         np.testing.assert_array_equal(again.npz["keypoints.npz"][k], v, err_msg=k)
-    assert again.json["report.json"]["search"] == whole.json["report.json"]["search"]
+    report = whole.json["report.json"]
+    assert again.json["report.json"]["search"] == report["search"]
+    last = report["search"]["limbs"]
+    assert last == sorted(last, key=lambda e: e["loss"])
+    assert {k: v for k, v in last[0].items() if k != "loss"} == report["hypothesis"]
+
+
+def test_without_time_for_them_no_limbs_are_moved(walk):
+    _, masks, flow = walk
+    config = replace(TINY, iterations=(*TINY.iterations[:-1], 0))
+    search = reconstruct(_inputs(masks, flow), config, Silent()).json["report.json"]["search"]
+    assert search["limbs"] == search["final"][:1]
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_seed_others(walk):
