@@ -11,7 +11,7 @@ from slomo.reconstruct.flow import dense_flow
 from slomo.reconstruct.motion_segment import border_distance
 from slomo.reconstruct.segment import component_at, frame_certainty, frame_quality, spans
 from slomo.reconstruct.stage import DecodeConfig, MasksConfig, pack, run_decode, run_masks, unpack
-from slomo.reconstruct.still_segment import StillSegmenter
+from slomo.reconstruct.still_segment import StillSegmenter, _trimmed
 from slomo.reconstruct.surroundings import give_back_patches
 from slomo.reconstruct.votes import vote_over_time
 from slomo.stage import Artifact, Inputs, Silent
@@ -203,6 +203,35 @@ def test_still_segmenter_keeps_a_foot_whose_leg_looks_like_the_ground():
     found = StillSegmenter().segment(frames, dense_flow(frames), lambda f: None).masks
     assert (found & foot).sum() > 0.8 * foot.sum()
     assert iou(found, masks | foot)[foot.any((1, 2))].min() > 0.8
+
+
+def test_still_segmenter_keeps_a_coat_that_looks_like_shade_and_leaves_the_shadow_out():
+    """What is darker may be either: the coat's colours are not those of darkened ground."""
+    frames, masks = moving_disc(40, speed=3.0, camera=0.0)
+    ground = np.median(frames, axis=0)
+    y, x = np.mgrid[: masks.shape[1], : masks.shape[2]]
+    shadow, coat = np.zeros_like(masks), np.zeros_like(masks)
+    for t in range(40):
+        coat[t] = masks[t] & (np.abs(x - 60 - 3.0 * t) < 14)
+        shadow[t] = (((x - 60 - 3.0 * t) / 24) ** 2 + ((y - 84) / 9) ** 2 < 1) & ~masks[t]
+        frames[t][shadow[t]] = 0.75 * ground[shadow[t]]
+    frames[coat] = 45
+    found = StillSegmenter().segment(frames, dense_flow(frames), lambda f: None).masks
+    assert (found & coat).sum() > 0.95 * coat.sum()
+    assert (found & shadow).sum() < 0.25 * shadow.sum()
+    assert iou(found, masks).mean() > 0.85
+
+
+def test_rim_that_shows_more_of_the_background_is_trimmed():
+    ground = np.full((40, 60, 3), 90, np.uint8)
+    truth = np.zeros((40, 60), bool)
+    truth[12:28, 15:45] = True
+    sharp = np.where(truth[..., None], np.uint8(210), ground)
+    frame = cv2.GaussianBlur(sharp, (0, 0), 1.0)
+    fat = cv2.dilate(truth.astype(np.uint8), np.ones((3, 3))) > 0
+    trimmed = _trimmed(fat, frame, ground.astype(np.float32))
+    np.testing.assert_array_equal(trimmed[5:35, 16:44], truth[5:35, 16:44])  # corners are rounder than that
+    np.testing.assert_array_equal(_trimmed(truth, frame, ground.astype(np.float32))[:, 16:44], truth[:, 16:44])
 
 
 def test_still_segmenter_leaves_out_a_small_companion():

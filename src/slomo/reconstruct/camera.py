@@ -5,7 +5,7 @@
 - "moving": there is parallax; structure from motion.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -73,7 +73,8 @@ def estimate_camera(
     report |= {"parallax_px": parallax, "parallax_limit_px": limit}
     progress.update(0.2, f"residual of a turning camera {parallax:.2f} px")
     if parallax > limit:
-        structure = _structure(frames, masks, t, tracks, fit.R_world_cam, settings, report, progress)
+        kept = _fit_turning(pairs, len(keys), center, replace(settings, refine_focal=False))
+        structure = _structure(frames, masks, t, tracks, kept.R_world_cam, settings, report, progress)
         if structure is not None:
             progress.note(
                 f"camera: moving (structure from motion, {len(structure.frames)} of {report['key_frames']} key frames, "

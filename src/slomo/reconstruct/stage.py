@@ -13,8 +13,8 @@ from slomo.reconstruct.video import decode
 from slomo.stage import Artifact, Inputs, Progress
 
 DECODE_VERSION = 2
-MASKS_VERSION = 8
-CAMERA_VERSION = 6
+MASKS_VERSION = 9
+CAMERA_VERSION = 7
 QUALITIES = ("draft", "normal", "high")
 
 SEGMENTERS = ("auto", "u2netp", "still", "motion", "user")

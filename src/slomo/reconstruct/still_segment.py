@@ -30,6 +30,7 @@ _NOISE = 4.0  # levels of RGB that compression leaves
 _SOFT_PX = 0.8  # of the smoothing before frames are compared
 _SEEN = 0.6  # of the time, for which the subject may cover a place whose background is known
 _LEAST = 0.0015  # of the picture, a subject
+_SHADE = -0.1  # log odds where the background in shade would look the same
 _SURELY = 2.0  # log odds, of what belongs to the subject though nothing joins it
 
 
@@ -50,7 +51,7 @@ class StillSegmenter:
     """
 
     choice: Choice = field(default_factory=Choice)
-    rounds: int = 2
+    rounds: int = 3
     name: str = "still"
 
     def segment(self, frames: np.ndarray, flow: Flow, progress: Report) -> Masks:
@@ -62,7 +63,7 @@ class StillSegmenter:
         body: dict[int, np.ndarray] = {}
         for turn in range(self.rounds):
             median, spread = _background(frames, covered, sampled)
-            differs = {t: log_odds(_soft(frames[t]), median, spread, _NOISE) for t in range(T)}
+            differs = {t: _differs(frames[t], median, spread) for t in range(T)}
             if not body:
                 body = follow({t: _pieces(d) for t, d in differs.items()}, flow, self.choice)
             seen = {t: b for t, b in body.items() if b.mean() > 0.3 * _LEAST}
@@ -79,7 +80,7 @@ class StillSegmenter:
         masks, certainty = np.empty(frames.shape[:3], bool), np.zeros(T)
         for t, p in enumerate(blend_over_time(body, flow, lambda f: None, neighbours=1)):
             masks[t] = component_at(p > 0.45, body[t] if body[t].any() else None, reach=_reach(p > 0.5))
-            masks[t] |= _parts(p > 0.45, body[t])
+            masks[t] = _trimmed(masks[t] | _parts(p > 0.45, body[t]), frames[t], median)
             certainty[t] = frame_certainty(p, masks[t])
         return Masks(masks, certainty, {"chosen": self.choice.how})
 
@@ -120,6 +121,24 @@ def _background(frames: np.ndarray, covered: np.ndarray, sampled: np.ndarray) ->
         apart = np.sort(np.where(hidden, np.inf, np.abs(row - median[y]).mean(-1)), axis=0)
         spread[y] = np.take_along_axis(apart, middle[None], 0)[0]
     return median, spread
+
+
+def _differs(frame: np.ndarray, median: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """(H, W) log odds that a pixel is no background. What could be the background in shade is left to the colours, as
+    a dark coat looks like that too."""
+    now = _soft(frame)
+    odds = log_odds(now, median, spread, _NOISE)
+    unlike = np.linalg.norm(now - median, axis=-1) > 2.7 * (_NOISE + 1.5 * spread)
+    return np.where(unlike, np.maximum(odds, _SHADE), odds)
+
+
+def _trimmed(mask: np.ndarray, frame: np.ndarray, median: np.ndarray) -> np.ndarray:
+    """The mask without pixels of its outermost ring that differ from the background by less than half of what the body
+    next to them does: those show more background than body, by the camera's blur and the compression's."""
+    size = np.linalg.norm(frame.astype(np.float32) - median, axis=-1)
+    core = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.float32)
+    total, count = (cv2.boxFilter(x, -1, (5, 5), normalize=False) for x in (size * core, core))
+    return mask & ((core > 0) | (size * count >= 0.5 * total))
 
 
 def _pieces(differs: np.ndarray) -> np.ndarray:

@@ -121,13 +121,14 @@ def track_path(
     Args:
         epipolar: correspondences of the tracks between these frames.
         center: (2,) px, principal point.  focal: px, kept.  seed: of the draw of tracks where there are many.
-        turning: (N, 3, 3) rotations of a camera that only turns and explains as much as it can. Which part of them is
-            travel is unknown: the path is sought from none of them, all and half, until two agree.
+        turning: (N, 3, 3) rotations of a camera of this focal length that only turns and explains as much as it can.
+            Which part of them is travel is unknown: the path is sought from all of them, none and half, until two
+            agree. (One of refined focal length turns by several times as much where there is parallax.)
     """
     sightings = _Sightings(tracks, keys, center, focal, seed)
     turns = Rotation.from_matrix(turning[0].T @ turning).as_rotvec()
     found: list[TrackedPath] = []
-    for share in (0.0, 1.0, 0.5):
+    for share in (1.0, 0.0, 0.5):
         found.append(_from(epipolar, sightings, Rotation.from_rotvec(share * turns).as_matrix(), focal))
         found.sort(key=lambda path: path.cost)
         if len(found) > 1 and _SETTLED * found[1].cost < found[0].cost:
