@@ -19,6 +19,9 @@ from slomo.skeleton import Gait, Limb, Skeleton
 Array = np.ndarray
 Tensor = torch.Tensor
 GRAVITY = 9.81
+_AS_DEEP = 0.45  # share of the depth of a dip in self-similarity, for a shorter lag to be the period of a longer one
+_MULTIPLE = 0.06  # how far the longer one may be from a multiple of it
+_STRETCHES = (0.9, 0.95, 1.0, 1.05, 1.1), (0.95, 1.0, 1.05)  # of the likeliest stride frequency and the next
 
 
 @dataclass(frozen=True)
@@ -144,7 +147,8 @@ def stride_frequencies(obs: Observations, low: float, high: float) -> list[float
     """Candidate stride frequencies Hz from the self-similarity of the leg band, most likely first.
 
     Masks are cut to their box's lower half; the mean difference between frames a lag apart dips at the stride period,
-    and about as deep at half of it where left and right look alike: both readings of each dip are candidates.
+    about as deep at half of it where left and right look alike, and at its multiples: of each of the two deepest dips
+    the shortest lag that it is a multiple of is read in both ways, then the dips themselves.
     """
     import cv2
 
@@ -162,12 +166,22 @@ def stride_frequencies(obs: Observations, low: float, high: float) -> list[float
     d = np.array([np.abs(x[k:] - x[:-k]).mean() for k in lags])
     trend = np.convolve(np.pad(d, 8, "edge"), np.ones(17) / 17, "valid")
     dips = [i for i in range(1, len(d) - 1) if d[i] <= d[i - 1] and d[i] < d[i + 1]]
-    dips.sort(key=lambda i: d[i] - trend[i])
-    out: list[float] = []
-    for i in dips[:2]:
+    depth = trend - d
+    dips.sort(key=lambda i: -depth[i])
+
+    def lag(i: int) -> float:
         c = d[i - 1] - 2 * d[i] + d[i + 1]
-        lag = lags[i] + (0.5 * (d[i - 1] - d[i + 1]) / c if c > 0 else 0.0)
-        for f in (1 / (lag * dt), 0.5 / (lag * dt)):
+        return lags[i] + (0.5 * (d[i - 1] - d[i + 1]) / c if c > 0 else 0.0)
+
+    def whole(i: int) -> int:
+        """The shortest lag that dip i is a multiple of: after two strides or three all looks as alike as after one."""
+        parts = [j for j in dips if lags[j] < lags[i] and depth[j] > _AS_DEEP * depth[i]]
+        parts = [j for j in parts if abs(lag(i) / lag(j) / round(lag(i) / lag(j)) - 1) < _MULTIPLE]
+        return min(parts, key=lambda j: lags[j], default=i)
+
+    out: list[float] = []
+    for i in [*map(whole, dips[:2]), *dips[:2]]:
+        for f in (1 / (lag(i) * dt), 0.5 / (lag(i) * dt)):
             if low <= f <= high and all(abs(f / g - 1) > 0.06 for g in out):
                 out.append(float(f))
     return out
@@ -187,8 +201,8 @@ def gait_grid(obs: Observations, skeleton: Skeleton, *, leg: float, speed: float
         # Speed is uncertain (scale, path): a factor of two each way in the Froude number.
         if not gait.froude[0] / 2 <= froude <= gait.froude[1] * 2:
             continue
-        for f in frequencies[:3]:
-            for stretch in (0.95, 1.0, 1.05):
+        for f, stretches in zip(frequencies, _STRETCHES, strict=False):
+            for stretch in stretches:
                 out += [GaitHypothesis(gait.name, f * stretch, n / phases) for n in range(phases)]
     return out
 
