@@ -1,4 +1,4 @@
-"""Stride frequencies from the self-similarity of silhouettes."""
+"""Stride frequencies from the self-similarity of silhouettes, and which gaits are tried."""
 
 from types import SimpleNamespace
 
@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from slomo.pinhole import Intrinsics
-from slomo.reconstruct.hypotheses import stride_frequencies
+from slomo.reconstruct.fit import _diverse
+from slomo.reconstruct.hypotheses import GaitHypothesis, stride_frequencies
 
 FPS, WIDTH, HEIGHT = 30.0, 96, 64
 
@@ -44,3 +45,15 @@ def test_frequencies_stay_within_the_range():
     found = stride_frequencies(seen(1.2), 0.9, 1.5)  # type: ignore[arg-type]
     assert found
     assert all(0.9 <= f <= 1.5 for f in found)
+
+
+def test_every_gait_is_tried_though_all_phases_of_another_rank_before_it():
+    entries = [(n / 100, 0, GaitHypothesis("gallop", 2.0, n / 12), None) for n in range(12)]
+    entries += [(1.0 + n / 100, 0, GaitHypothesis("trot", 2.0, n / 12), None) for n in range(12)]
+    entries += [(2.0 + n / 100, 0, GaitHypothesis("walk", 2.0, n / 12), None) for n in range(12)]
+    chosen = _diverse(entries, 6)
+    assert [e[2].name for e in chosen[:3]] == ["gallop", "trot", "walk"]
+    assert [e[0] for e in chosen[:3]] == [0.0, 1.0, 2.0]
+    assert len(chosen) == 6
+    assert any(e[2] == GaitHypothesis("gallop", 2.0, 6 / 12) for e in chosen)  # the best one's opposite
+    assert [e[2].name for e in _diverse(entries, 2)] == ["gallop", "gallop"]  # and that before another gait

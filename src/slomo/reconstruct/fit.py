@@ -161,14 +161,16 @@ def _lay(base: Guess, poses: list[tuple[np.ndarray, np.ndarray]]) -> Guess:
 
 
 def _diverse(entries: list, count: int) -> list:
-    """The best entries that differ: in gait, in phase by a sixth, in frequency by a fifth, or in heading; and the best
-    one's left-right opposite, so that a swap of the legs is always weighed against it."""
+    """The best entry of every gait, for what is laid over the body as it is may rank a wrong gait first in all its
+    phases; then the best that differ in phase by a sixth, in frequency by a fifth, or in heading; and the best one's
+    left-right opposite, so that a swap of the legs is always weighed against it."""
 
     def far(a: GaitHypothesis, b: GaitHypothesis) -> bool:
         turn = abs((a.phase - b.phase + 0.5) % 1.0 - 0.5)
         return a.name != b.name or turn > 1 / 6.5 or abs(math.log(a.frequency / b.frequency)) > 0.15
 
-    out: list = []
+    firsts = {e[2].name: e for e in reversed(entries)}
+    out = sorted(firsts.values(), key=lambda e: e[0])[:count]
     for e in entries:
         if len(out) == count:
             break
