@@ -73,8 +73,10 @@ def estimate_camera(
     report |= {"parallax_px": parallax, "parallax_limit_px": limit}
     progress.update(0.2, f"residual of a turning camera {parallax:.2f} px")
     if parallax > limit:
-        kept = _fit_turning(pairs, len(keys), center, replace(settings, refine_focal=False))
-        structure = _structure(frames, masks, t, tracks, kept.R_world_cam, settings, report, progress)
+        turned = fit  # the path is sought with the focal length that is set
+        if fit.focal != settings.focal:
+            turned = _fit_turning(pairs, len(keys), center, replace(settings, refine_focal=False))
+        structure = _structure(frames, masks, t, tracks, turned.R_world_cam, settings, report, progress)
         if structure is not None:
             progress.note(
                 f"camera: moving (structure from motion, {len(structure.frames)} of {report['key_frames']} key frames, "

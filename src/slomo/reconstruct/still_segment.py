@@ -30,7 +30,7 @@ _NOISE = 4.0  # levels of RGB that compression leaves
 _SOFT_PX = 0.8  # of the smoothing before frames are compared
 _SEEN = 0.6  # of the time, for which the subject may cover a place whose background is known
 _LEAST = 0.0015  # of the picture, a subject
-_SHADE = -0.1  # log odds where the background in shade would look the same
+_SHADE = -0.1  # log odds of what could be the background in shade: the colours decide, a dark coat looks so too
 _SURELY = 2.0  # log odds, of what belongs to the subject though nothing joins it
 
 
@@ -63,7 +63,7 @@ class StillSegmenter:
         body: dict[int, np.ndarray] = {}
         for turn in range(self.rounds):
             median, spread = _background(frames, covered, sampled)
-            differs = {t: _differs(frames[t], median, spread) for t in range(T)}
+            differs = {t: log_odds(_soft(frames[t]), median, spread, _NOISE, shade=_SHADE) for t in range(T)}
             if not body:
                 body = follow({t: _pieces(d) for t, d in differs.items()}, flow, self.choice)
             seen = {t: b for t, b in body.items() if b.mean() > 0.3 * _LEAST}
@@ -121,15 +121,6 @@ def _background(frames: np.ndarray, covered: np.ndarray, sampled: np.ndarray) ->
         apart = np.sort(np.where(hidden, np.inf, np.abs(row - median[y]).mean(-1)), axis=0)
         spread[y] = np.take_along_axis(apart, middle[None], 0)[0]
     return median, spread
-
-
-def _differs(frame: np.ndarray, median: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """(H, W) log odds that a pixel is no background. What could be the background in shade is left to the colours, as
-    a dark coat looks like that too."""
-    now = _soft(frame)
-    odds = log_odds(now, median, spread, _NOISE)
-    unlike = np.linalg.norm(now - median, axis=-1) > 2.7 * (_NOISE + 1.5 * spread)
-    return np.where(unlike, np.maximum(odds, _SHADE), odds)
 
 
 def _trimmed(mask: np.ndarray, frame: np.ndarray, median: np.ndarray) -> np.ndarray:
