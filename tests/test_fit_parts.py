@@ -65,14 +65,18 @@ def test_bones_keep_their_lengths(kin: Kinematics):
 
 
 def test_a_body_beside_its_feet_is_out_of_balance(kin: Kinematics):
-    q = torch.zeros(2, 3, kin.B, 3)
+    q = torch.zeros(3, 3, kin.B, 3)
     legs = [limb.swing for limb in kin.skeleton.limbs]
+    if kin.skeleton.kind == "human":
+        q[:, :, legs, 1] = 0.07  # feet a little behind: the weight is on the soles
     q[1, :, legs, 0] = 0.15  # all legs to the same side
+    q[2, :, legs, 1] = -0.2  # all legs ahead
     body = _posed(kin, q, torch.eye(3))
-    state = cast(losses.State, SimpleNamespace(body=body, kin=kin, R_root=torch.eye(3).expand(2, 3, 3, 3)))
-    straight, leaning = losses.balance(state).tolist()
-    assert straight == pytest.approx(0, abs=1e-6)
+    state = cast(losses.State, SimpleNamespace(body=body, kin=kin, R_root=torch.eye(3).expand(3, 3, 3, 3)))
+    straight, leaning, back = losses.balance(state).tolist()
+    assert straight == pytest.approx(0, abs=0.02)
     assert leaning > 1
+    assert back > 1 if kin.skeleton.kind == "human" else back == pytest.approx(0, abs=1e-6)
 
 
 def _random_outline(generator: torch.Generator) -> list[torch.Tensor]:

@@ -188,7 +188,7 @@ def test_the_network_s_word_is_kept_by_the_contract(network):
 
 
 def test_without_anybody_there_is_nothing():
-    for config, said in ((stage.Config(prior="none"), "no prior"), (stage.Config(), "used unless you name it")):
+    for config, said in ((stage.Config(prior="none"), "no prior"), (stage.Config(), "name your own")):
         notes = Notes()
         arrays, report = run(config, notes)
         assert said in " ".join(notes.said)

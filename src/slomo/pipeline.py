@@ -139,13 +139,11 @@ def _find_weights() -> Path | None:
 
 
 def _find_prior(skeleton: str | Path) -> Path | None:
-    """The weights that come with slomo for the kind of this skeleton and that make its fit better: those for people do
-    not yet, and are used only when they are named. Raises `UsageError`, `InvalidData`."""
+    """The weights that come with slomo for the kind of this skeleton. Raises `UsageError`, `InvalidData`."""
     from slomo.prior.inference import packaged
     from slomo.skeleton import load_skeleton
 
-    kind = load_skeleton(skeleton).kind
-    return packaged(kind) if kind != "human" else None
+    return packaged(load_skeleton(skeleton).kind)
 
 
 @dataclass(frozen=True)

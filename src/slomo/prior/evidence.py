@@ -20,9 +20,7 @@ from slomo.skeleton import Skeleton
 Array = np.ndarray
 
 GRID = 64  # side of the dense arrays that are kept
-# Share of the joints of a pair whose sides a network has right in a clip it has not learnt from. People are as often
-# seen from behind as from the front by a network that errs for a whole clip: nothing is made of their sides.
-SIDE = {"quadruped": 0.75}
+SIDE = 0.75  # share of the joints of a pair whose sides a network has right in a clip it has not learnt from
 NO_SIDE = 0.5
 MODEL_SIDE = 0.75  # of a model of the user's, likewise
 _REACH = 0.012  # of the box's side: flow is averaged over this around a key point
@@ -126,10 +124,13 @@ def from_network(
         "view_certainty": float(np.where(apart < np.radians(25), view, 0).sum(1).mean()),
         "view_repaired_frames": int((np.where(apart < np.radians(45), seen.view, 0).sum(1) < 0.5).sum()),
     }
-    side = SIDE.get(labels.kind, NO_SIDE)
+    # People are as often seen from behind as from the front by a network that errs for a whole clip: of their view's
+    # mirror image and of their sides as much is made as the way of travel says.
+    told = travelled(shots.travel)[:, None] if labels.kind == "human" else np.ones((len(view), 1))
+    side = NO_SIDE + (SIDE - NO_SIDE) * float(told.mean())
     arrays = {
         "part_side": np.float32(side),
-        "view": view if labels.kind in SIDE else 0.5 * (view + front_to_back(view)),
+        "view": told * view + (1 - told) * 0.5 * (view + front_to_back(view)),
         "view_up": up,
         "view_path": path,
         "parts": np.rint(255 * _grid(parts)).astype(np.uint8),
@@ -139,6 +140,11 @@ def from_network(
     confidence = (sure * shots.quality[:, None]).astype(np.float32)
     px = from_crop(places, shots.box[:, None], seen.size).astype(np.float32)
     return Columns(labels.keypoints, px, confidence, side), Dense(arrays, axes, length), report
+
+
+def travelled(travel: Array) -> Array:
+    """(F,) how much the way of travel says, of (F, 36) probabilities of the view: 0 where all are alike."""
+    return 1 - travel.shape[1] * travel.min(1)
 
 
 def front_to_back(view: Array) -> Array:

@@ -21,7 +21,7 @@ from slomo.stage import Arrays, Artifact, Inputs, Progress
 
 Array = np.ndarray
 
-VERSION = 7
+VERSION = 8
 MOST_FRAMES = 600  # that are looked at: each takes 3 MB, and long clips are not to take more than others
 
 PRIORS = ("auto", "none")
@@ -122,7 +122,7 @@ def _prior(inputs: Inputs, config: Config, known: Labels, progress: Progress) ->
         return None
     if path is None:
         progress.note(
-            f"evidence: no prior, slomo has none for {known.kind!r} that is used unless you name it (--prior FILE)"
+            f"evidence: no prior, slomo has none for a skeleton of kind {known.kind!r} (name your own: --prior FILE)"
         )
         return None
     prior = Prior(path)

@@ -132,8 +132,9 @@ def gather(arrays: Mapping[str, Array], obs: Observations, skeleton: Skeleton) -
     blur, _ = rows("surface_scale", like=surface.shape[2:])
     doubted = side * parts + (1 - side) * parts[:, known.mirror_part] if has_parts.any() else parts
     points = _surface(surface, blur, has_surface, parts if has_parts.any() else None, box, obs, learnt(skeleton))
-    # The place on the other limb is as likely as the sides are doubtful: what is left is the difference of the two.
-    sided = known.mirror_part[known.capsule_part] != known.capsule_part
+    # The place on the other limb is as likely as the sides are doubtful: what is left is the difference of the two. A
+    # person whose sides are in doubt may as well be seen from behind as from the front, and the trunk with them.
+    sided = (known.mirror_part[known.capsule_part] != known.capsule_part) | (known.kind == "human")
     points["sure"] = points["sure"] * f(np.where(sided, 2 * side - 1, 1.0))[points["capsule"]]
     area = obs.mask.sum(1).numpy().astype(float)
     size = np.sqrt(np.maximum(area, 0.25 * np.median(area[area > 0])))

@@ -21,6 +21,8 @@ from slomo.stage import Progress
 Tensor = torch.Tensor
 
 TIE = 0.03  # a rival whose loss is higher by this share may still win in the end
+ELSEWHERE = 0.1  # body lengths between the feet of two hypotheses that move their legs otherwise, on average
+_MOTION = ("gait", "legs")
 PHASES = ("heading", "gait", "rivals", "final", "limbs")
 FINAL = PHASES.index("final")  # from there on little is between two hypotheses, and many draws tell them apart
 
@@ -210,12 +212,22 @@ def _to_rivals(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
 
 
 def _to_final(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
-    """The best one goes on, and with it the best that moves its legs otherwise if it is as good but for `TIE`."""
+    """The best one goes on, and with it the best that moves its legs otherwise if it is as good but for `TIE`: by what
+    it was made of, or by where its feet are (one gait half a stride later is its left-right opposite)."""
     order = losses.argsort().tolist()
     own = run.labels[order[0]]
-    other = [k for k in order if any(run.labels[k].get(w) != own.get(w) for w in ("gait", "legs"))]
+    away = _feet_apart(problem, run, order[0]).tolist()
+    other = [k for k in order[1:] if away[k] > ELSEWHERE or any(run.labels[k].get(w) != own.get(w) for w in _MOTION)]
     which = torch.tensor(order[:1] + [k for k in other[:1] if losses[k] < (1 + TIE) * losses[order[0]]])
     return Run(3, pick(run.x, which), run.guess.pick(which), [run.labels[int(k)] for k in which], run.log)
+
+
+def _feet_apart(problem: Problem, run: Run, one: int) -> Tensor:
+    """(H,) mean distance of the feet of each hypothesis from those of `one`, body lengths."""
+    with torch.no_grad():
+        s = problem.state(run.x, run.guess, problem.draw(1, 2, torch.Generator().manual_seed(0)), stance_weight=0.0)
+        feet = s.body.nodes[:, :, problem.kin.contacts]
+        return (feet - feet[one]).norm(dim=-1).mean((1, 2)) / s.body.length[one]
 
 
 def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, *_) -> Run:

@@ -15,6 +15,7 @@ _FOREIGN = 0.2  # part of the body's motion, below which a patch does not share 
 _LOST = 64.0  # px, a motion that flow cannot have followed
 _ASTRAY = 1.5  # px, median motion of the whole picture, from which on the homography has not been found
 _BENDS = 1.5  # px of motion that no flat thing has, from which on a body is said to be alive
+_CALM = 0.3, 0.45  # px as a whole and of bending, likewise before a camera that stands still, where things have 0.06
 _KEPT = 64  # frames whose motion is remembered
 _STILL = 0.3  # px of the median motion, below which the camera stands still and nothing has parallax
 
@@ -59,8 +60,8 @@ class SharedMotion:
 
     def liveliness(self, t: int, mask: np.ndarray) -> float:
         """How surely (H, W) bool is alive in frame t; from 1 on it is: it moves fast as a whole, or its liveliest tenth
-        moves in a way that no flat thing does (what an affine motion leaves), as parallax cannot make a box do. Fast is
-        a quarter of that before a camera that stands still."""
+        moves in a way that no flat thing does (what an affine motion leaves), as parallax cannot make a box do. Before
+        a camera that stands still nothing but noise moves a thing, and much less is enough."""
         small = cv2.resize(mask.astype(np.float32), self._size, interpolation=cv2.INTER_AREA) > 0.9
         y, x = np.nonzero(small & np.isfinite(self.residual(t)[..., 0]))
         if len(x) < 20:
@@ -70,8 +71,8 @@ class SharedMotion:
         rest = np.linalg.norm(motion - design @ np.linalg.lstsq(design, motion, rcond=None)[0], axis=-1)
         calm = rest <= np.quantile(rest, 0.7)  # limbs must not bend the motion of the whole
         rest = np.linalg.norm(motion - design @ np.linalg.lstsq(design[calm], motion[calm], rcond=None)[0], axis=-1)
-        fast = (0.5 if self._drift[t] < _STILL else 2.0) * MOVES
-        return float(max(np.quantile(rest, 0.9) / _BENDS, np.linalg.norm(np.median(motion, axis=0)) / fast))
+        fast, bends = _CALM if self._drift[t] < _STILL else (2.0 * MOVES, _BENDS)
+        return float(max(np.quantile(rest, 0.9) / bends, np.linalg.norm(np.median(motion, axis=0)) / fast))
 
     def movers(self, t: int) -> list[np.ndarray]:
         """Where (H, W) bool something moves in frame t, at most three places, by how much moves there."""
