@@ -12,10 +12,13 @@ import pytest
 
 from slomo.errors import InvalidData, UsageError
 from slomo.motion import KeypointMotion
+from slomo.skeleton import load_skeleton
 from slomo.stage import Silent
+from slomo.synth import figure
 from slomo.synth.animal import ANIMALS, BONES, FEET, KEYPOINTS, proportions, rest_joints
 from slomo.synth.clip import EMBEDDED as EMBEDDED_CONFIG
 from slomo.synth.clip import Config, truth, write_clip
+from slomo.synth.creature import create
 from slomo.synth.gait import GAITS, animate
 from slomo.synth.score import score
 
@@ -39,6 +42,46 @@ def test_paws_stand_still_and_bones_keep_their_length(animal, gait):
     for a, b in legs:
         length = np.linalg.norm(m.keypoints[:, KEYPOINTS.index(a)] - m.keypoints[:, KEYPOINTS.index(b)], axis=1)
         assert np.allclose(length, np.linalg.norm(rest[a] - rest[b]), rtol=1e-6)
+
+
+@pytest.mark.parametrize("move", figure.MOVES)
+def test_people_stand_still_and_over_their_soles(move):
+    skeleton = load_skeleton("human")
+    c = create(skeleton, 3)
+    walks = move in figure.STRIDES
+    m = figure.pose(c, move, T, height=1.7, speed=None, turn=0.2 if walks else 0.0, seed=3)
+    rest = np.linalg.norm(c.offset, axis=1)
+    at = {n: j for j, n in enumerate(skeleton.names)}
+    balls = m.nodes[:, [at["left_toe"], at["right_toe"]]]
+    both = m.contact[1:] & m.contact[:-1]
+    assert both.mean() > 0.2
+    assert np.abs(np.diff(balls, axis=0)[both]).max() < 1e-6
+    assert np.allclose(balls[..., 2][m.contact], skeleton.sole, atol=1e-6)
+    assert balls[..., 2].min() > 0.5 * skeleton.sole
+    for j in range(1, len(skeleton.names)):
+        length = np.linalg.norm(m.nodes[:, j] - m.nodes[:, skeleton.link[j]], axis=1)
+        assert np.allclose(length, rest[j])
+    ankles = m.nodes[:, [at["left_ankle"], at["right_ankle"]]]
+    away = (m.nodes[:, at["pelvis"]] - (ankles + balls).mean(1) / 2)[:, :2]
+    assert np.abs(away.mean(0)).max() < 0.08
+    knees = m.nodes[:, [at["left_knee"], at["right_knee"]]]
+    hips = m.nodes[:, [at["left_hip"], at["right_hip"]]]
+    ahead = m.R[:, 0, :, 0]
+    bent = ((knees - (hips + ankles) / 2) * ahead[:, None]).sum(-1)
+    assert bent.min() > -0.01  # knees do not bend backwards
+    smooth = np.abs(np.diff(m.nodes[:, 0, 2], 2)).max() * 30**2 * 1.7
+    assert smooth < 20  # m/s^2 of the pelvis, up and down
+
+
+def test_who_is_on_the_spot_does_not_travel():
+    with pytest.raises(UsageError, match="on the spot"):
+        truth(Config(animal="person", gait="squat", speed=1.0))
+    with pytest.raises(UsageError, match="valid: walk, run"):
+        Config(animal="person", gait="trot")
+    z = truth(Config(animal="person", gait="walk", speed=1.2, camera="static", seed=2))
+    assert np.linalg.norm((z["keypoints"][-1, 0] - z["keypoints"][0, 0])[:2]) == pytest.approx(1.2 * T[-1], rel=0.05)
+    assert z["kind"] == "human"
+    assert 1.5 < z["body_length"] < 1.95
 
 
 def test_a_walk_is_a_lateral_sequence_that_always_has_support():

@@ -100,8 +100,14 @@ def add_commands(app: typer.Typer) -> None:
     def synth(
         session: Session,
         out_dir: Annotated[Path, typer.Argument(help="Folder for clip.mp4, truth.npz and masks.npz.")],
-        animal: Annotated[str | None, typer.Option(metavar="dog|cat|horse", help="Default: dog.")] = None,
-        gait: Annotated[str | None, typer.Option(metavar="walk|pace|trot|stand", help="Default: walk.")] = None,
+        animal: Annotated[str | None, typer.Option(metavar="dog|cat|horse|person", help="Default: dog.")] = None,
+        gait: Annotated[
+            str | None,
+            typer.Option(
+                metavar="NAME",
+                help="walk, pace, trot, stand; of a person walk, run, stand, squat, jack, wave. Default: walk.",
+            ),
+        ] = None,
         speed: Annotated[float | None, typer.Option(help="m/s; 0: the usual speed of the gait.")] = None,
         turn: Annotated[float | None, typer.Option(help="Degrees a second, positive to the left.")] = None,
         camera: Annotated[str | None, typer.Option(metavar="follow|orbit|pan|static", help="Default: follow.")] = None,
@@ -116,11 +122,12 @@ def add_commands(app: typer.Typer) -> None:
         crf: Annotated[int | None, typer.Option(help="H.264 quality; lower is better.")] = None,
         seed: Annotated[int | None, typer.Option(help="Of the animal, the place and the hand.")] = None,
     ) -> None:
-        """A rendered clip of an animal, with its truth.
+        """A rendered clip of an animal or a person, with its truth.
 
         \b
         slomo synth trot --gait trot --seconds 3 --seed 1
         slomo run trot/clip.mp4 --truth trot/truth.npz --robot go1
+        slomo synth jack --animal person --gait jack --camera orbit --view 80
         """
         from slomo import settings
         from slomo.store import writing

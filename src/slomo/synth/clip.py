@@ -1,4 +1,4 @@
-"""Render a clip of the procedural animal, with its truth: `clip.mp4`, `truth.npz` and `masks.npz`."""
+"""Render a clip of a procedural animal or person, with its truth: `clip.mp4`, `truth.npz` and `masks.npz`."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -11,9 +11,7 @@ from slomo.errors import UsageError
 from slomo.formats.mp4 import encode_mp4
 from slomo.raycast import Part, Scene
 from slomo.stage import Progress
-from slomo.synth.animal import ANIMALS, BONES, FEET, KEYPOINTS, proportions
-from slomo.synth.body import build_body
-from slomo.synth.gait import GAITS, animate
+from slomo.synth.actor import ACTORS, Actor, act, moves
 from slomo.synth.scene import ANIMAL, CAMERAS, camera, light, surroundings
 
 
@@ -22,8 +20,9 @@ class Config:
     """What is rendered; the same config and seed give the same truth.
 
     Attributes:
-        animal: "dog", "cat" or "horse"; its proportions and coat vary with the seed.
-        gait: "walk", "pace", "trot" or "stand".  speed: m/s; 0 = the usual speed of the gait.
+        animal: "dog", "cat", "horse" or "person"; its proportions and coat, or clothes, vary with the seed.
+        gait: "walk", "pace", "trot" or "stand"; of a person "walk", "run", "stand", "squat", "jack" or "wave".
+        speed: m/s; 0 = the usual speed of the gait.
         turn: degrees/s, positive to the left.
         camera: "follow", "orbit", "pan" or "static".  view: degrees, 0 = the left flank, 90 = from the front.
         shake: camera shake, 1 = a hand.  clutter: posts near the animal.
@@ -49,7 +48,8 @@ class Config:
     seed: int = 0
 
     def __post_init__(self):
-        for name, known in (("animal", ANIMALS), ("gait", tuple(GAITS)), ("camera", CAMERAS)):
+        known_animal = self.animal if self.animal in ACTORS else ACTORS[0]
+        for name, known in (("animal", ACTORS), ("gait", moves(known_animal)), ("camera", CAMERAS)):
             if getattr(self, name) not in known:
                 raise UsageError(f"no {name} {getattr(self, name)!r}", where="synth", valid=known)
         for name, low, high in (("seconds", 0.2, 120), ("fps", 5, 240), ("width", 64, 3840), ("height", 64, 2160)):
@@ -63,49 +63,43 @@ class Config:
 EMBEDDED = Config(width=640, height=360, crf=26)
 
 
-def _motion(config: Config):
-    p = proportions(config.animal, config.seed)
+def _staged(config: Config) -> tuple[Actor, np.ndarray, np.ndarray]:
+    """The actor, K (3, 3) px and T_world_cam (T, 4, 4)."""
     t = np.arange(round(config.seconds * config.fps)) / config.fps
+    turn, view, size = np.radians(config.turn), np.radians(config.view), (config.width, config.height)
     try:
-        speed = config.speed or None
-        motion = animate(p, config.gait, t, speed=speed, turn=np.radians(config.turn), seed=config.seed)
+        actor = act(config.animal, config.gait, t, speed=config.speed or None, turn=turn, seed=config.seed)
     except ValueError as e:
         raise UsageError(str(e), where="synth", todo="give a lower --speed or another --gait") from None
-    k = motion.keypoints
-    length = float(np.linalg.norm(k[:, KEYPOINTS.index("nose")] - k[:, KEYPOINTS.index("tail_tip")], axis=1).mean())
-    target = (k[:, KEYPOINTS.index("nose")] + k[:, KEYPOINTS.index("tail_tip")]) / 2
-    target[:, 2] = 0.55 * p.height
-    view, size = np.radians(config.view), (config.width, config.height)
-    cam = camera(config.camera, target, t, length=length, view=view, size=size, shake=config.shake, seed=config.seed)
-    return p, motion, target, *cam
+    K, T_world_cam = camera(
+        config.camera, actor.target, t, length=actor.length, view=view, size=size, shake=config.shake, seed=config.seed
+    )
+    return actor, K, T_world_cam
 
 
 def truth(config: Config) -> dict[str, Any]:
     """The arrays of `truth.npz`, without rendering anything.
 
     `keypoints` (T, N, 3) m, world, z up, ground at 0, joint centres named `keypoint_names`; `T_world_cam` (T, 4, 4) in
-    the OpenCV convention; `K` (3, 3) px; `foot_contact` (T, 4) for `foot_names`; `body_length` m (withers to tail
-    base); `contact_height` (m) and `contact_speed` (m/s) as thresholds for a contact detector; `bones` as "a-b";
-    `config` as JSON.
+    the OpenCV convention; `K` (3, 3) px; `foot_contact` (T, feet) for `foot_names`; `kind` of the skeleton;
+    `body_length` m (withers to tail base, standing height); `contact_height` (m) and `contact_speed` (m/s) as
+    thresholds for a contact detector; `bones` as "a-b"; `config` as JSON.
     """
-    _, motion, _, K, T_world_cam = _motion(config)
-    k = motion.keypoints
-    a, b = KEYPOINTS.index("withers"), KEYPOINTS.index("tail_base")
-    body_length = float(np.linalg.norm(k[:, a] - k[:, b], axis=1).mean())
+    actor, K, T_world_cam = _staged(config)
     return dict(
         fps=np.float64(config.fps),
         K=K,
         T_world_cam=T_world_cam,
-        keypoints=k,
-        keypoint_names=np.array(KEYPOINTS),
-        foot_contact=motion.contact,
-        foot_names=np.array([f"{f}_paw" for f in FEET]),
-        kind=np.array("quadruped"),
-        body_length=np.float64(body_length),
-        contact_height=np.float64(0.055 * body_length),
-        contact_speed=np.float64(0.7 * body_length),
+        keypoints=actor.keypoints,
+        keypoint_names=np.array(actor.names),
+        foot_contact=actor.contact,
+        foot_names=np.array(actor.feet),
+        kind=np.array(actor.kind),
+        body_length=np.float64(actor.body_length),
+        contact_height=np.float64(actor.contact_height),
+        contact_speed=np.float64(actor.contact_speed),
         image_size=np.array([config.width, config.height]),
-        bones=np.array([f"{x}-{y}" for x, y in BONES]),
+        bones=np.array([f"{x}-{y}" for x, y in actor.bones]),
         gravity=np.array([0.0, 0, -1]),
         config=np.array(json.dumps(asdict(config))),
     )
@@ -113,19 +107,20 @@ def truth(config: Config) -> dict[str, Any]:
 
 def render(config: Config, progress: Progress):
     """Yield (rgb (H, W, 3) uint8 with sensor noise, mask (H, W) bool) frame by frame."""
-    p, motion, target, K, T_world_cam = _motion(config)
-    body = build_body(config.animal, p, config.seed)
-    eye = T_world_cam[:, :2, 3]
-    parts = surroundings(target[:, :2], eye, p.height, clutter=config.clutter, seed=config.seed)
-    coat = Part(body.vertices, body.triangles, body.colors, ANIMAL, grain=0.35, grain_size=0.012 * p.height)
-    toward = float(np.arctan2(*(eye - target[:, :2]).mean(0)[::-1]))
-    scene = Scene({"animal": coat, **parts}, light(p.height, toward, config.seed))
+    actor, K, T_world_cam = _staged(config)
+    skin = actor.skin()
+    eye, path = T_world_cam[:, :2, 3], actor.target[:, :2]
+    parts = surroundings(path, eye, actor.size, clutter=config.clutter, seed=config.seed)
+    coat = Part(skin.at(0), skin.triangles, skin.colors, ANIMAL, grain=0.35, grain_size=0.012 * actor.size)
+    toward = float(np.arctan2(*(eye - path).mean(0)[::-1]))
+    scene = Scene({"animal": coat, **parts}, light(actor.size, toward, config.seed))
     rng = np.random.default_rng([config.seed, 7])
-    for i in range(len(motion.t)):
-        scene.move({"animal": body.skin(motion.keypoints[i], motion.lateral[i])})
+    frames = len(actor.keypoints)
+    for i in range(frames):
+        scene.move({"animal": skin.at(i)})
         image = scene.render(K, T_world_cam[i], (config.width, config.height), supersample=2)
         noise = config.noise * rng.standard_normal(image.rgb.shape, np.float32)
-        progress.update((i + 1) / len(motion.t), f"frame {i + 1} of {len(motion.t)}")
+        progress.update((i + 1) / frames, f"frame {i + 1} of {frames}")
         yield np.clip(image.rgb + noise + 0.5, 0, 255).astype(np.uint8), image.mask(ANIMAL)
 
 

@@ -56,7 +56,7 @@ def smooth_random(rng: np.random.Generator, t: np.ndarray, period: float, n: int
     return (wave / np.sqrt(k)[:, None]).sum(1) / 1.44
 
 
-class _Path:
+class Path:
     """Where the trunk's middle is and looks at time t: constant speed (m/s) and turning rate (rad/s)."""
 
     def __init__(self, speed: float, turn: float, middle: float):
@@ -84,7 +84,7 @@ def _two_bones(a: np.ndarray, c: np.ndarray, ab: float, bc: float, bend: np.ndar
     return a + along * x + np.sqrt(np.maximum(ab**2 - along**2, 0)) * y / np.linalg.norm(y, axis=1, keepdims=True)
 
 
-def _feet(gait: Gait, rate: float, t: np.ndarray, path: _Path, rest: dict[str, np.ndarray], lift: float, rng):
+def _feet(gait: Gait, rate: float, t: np.ndarray, path: Path, rest: dict[str, np.ndarray], lift: float, rng):
     """Paw positions (T, 4, 3), contact (T, 4), and the signed stride phase (T, 4): stance 0..1, swing 1..2."""
     paws, contact, phase = np.zeros((len(t), 4, 3)), np.zeros((len(t), 4), bool), np.zeros((len(t), 4))
     start = rng.uniform()
@@ -120,7 +120,7 @@ def animate(p: Proportions, gait_name: str, t: np.ndarray, *, speed: float | Non
     v = usual if speed is None else speed
     # Animals lengthen and quicken their stride together as they speed up.
     rate = gait.rate * np.sqrt(G / hip) * (np.sqrt(v / usual) if usual and v else 1.0)
-    path = _Path(v, turn, p.trunk * h / 2)
+    path = Path(v, turn, p.trunk * h / 2)
     paws, contact, phase = _feet(gait, rate, t, path, rest, 0.10 * h, rng)
 
     moving = 1.0 if v or turn else 0.0
