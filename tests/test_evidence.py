@@ -9,12 +9,13 @@ import torch
 
 from slomo.pinhole import Intrinsics
 from slomo.prior.labels import BINS, labels
-from slomo.reconstruct import evidence_terms, hypotheses, losses, silhouette
+from slomo.reconstruct import evidence_terms, fit, hypotheses, losses, silhouette
 from slomo.reconstruct.evidence import Evidence, gather, nearest
 from slomo.reconstruct.hypotheses import GaitHypothesis, exchanged
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.observations import Observations, observe
 from slomo.reconstruct.problem import Draw, Problem, Schedule, optimise
+from slomo.reconstruct.run import Run, join
 from slomo.reconstruct.trajectory import Guess, Trajectory
 from slomo.skeleton import load_skeleton
 
@@ -324,3 +325,32 @@ def test_parts_of_doubted_sides_speak_for_both_limbs(scene: Scene):
     assert torch.allclose(even.chance[..., 0][seen], even.chance[..., 1][seen])
     sided = KNOWN.mirror_part[KNOWN.capsule_part] != KNOWN.capsule_part
     assert (even.sure[torch.as_tensor(sided)[even.capsule]] == 0).all()
+
+
+@pytest.mark.parametrize(("side", "trunk"), [(0.5, 0.0), (0.75, 0.5), (1.0, 1.0)])
+def test_a_person_whose_sides_are_in_doubt_may_as_well_be_seen_from_behind(scene: Scene, side: float, trunk: float):
+    """The surface of the trunk tells front from back, so it counts no more than the sides do."""
+    person = load_skeleton("human")
+    known = labels(person)
+    label = 1 + known.parts.index("trunk")
+    parts = np.zeros((T, len(known.parts) + 1, GRID, GRID), np.uint8)
+    parts[:, label] = 255
+    arrays = dict(
+        frame=np.arange(T), box=np.tile(BOX, (T, 1)), part_names=np.array(known.parts), parts=parts, part_side=side,
+        surface=np.zeros((T, 3, GRID, GRID)), surface_scale=np.zeros((T, GRID, GRID)),
+    )  # fmt: skip
+    sure = gather(arrays, scene.obs, person).sure
+    np.testing.assert_allclose(sure, trunk, atol=1e-6)
+
+
+def test_the_same_gait_half_a_stride_later_goes_into_the_final(scene: Scene):
+    """It is the left-right opposite, though it is called the same; a hypothesis whose legs are as the best's is not."""
+    labels = [{"gait": "walk", "phase": p} for p in (0.1, 0.12, 0.6)]
+    poses = [_guess(phase=label["phase"]) for label in labels]
+    x = {k: v.repeat(3, *[1] * (v.ndim - 1)) for k, v in scene.x.items()}
+    run = Run(2, x, join(poses), labels)
+    problem = scene.problem(None, {"mask": 1.0})
+    chosen = fit._to_final(problem, run, torch.tensor([1.0, 1.001, 1.01]))
+    assert [label["phase"] for label in chosen.labels] == [0.1, 0.6]
+    alone = fit._to_final(problem, run, torch.tensor([1.0, 1.001, 1.1]))
+    assert [label["phase"] for label in alone.labels] == [0.1]

@@ -198,6 +198,14 @@ def test_shared_motion():
     assert motion.liveliness(6, animal[6]) > 1 > motion.liveliness(6, still[6])
 
 
+def test_a_little_motion_is_enough_before_a_camera_that_stands_still():
+    things = [(post, lambda t: 150.0, GREY), (body, lambda t: 60 + 0.25 * t, RED)]
+    frames, (still, animal) = scene(12, things)
+    motion = SharedMotion(dense_flow(frames))
+    assert motion.liveliness(6, animal[6]) > 1
+    assert motion.liveliness(6, still[6]) < 0.3
+
+
 def test_look_knows_its_own():
     frames, (a, b) = scene(3, [(small_body, lambda t: 40.0, GREEN), (body, lambda t: 140.0, RED)])
     look = Look()

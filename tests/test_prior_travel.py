@@ -6,6 +6,7 @@ import pytest
 from slomo.ground_path import ground_path
 from slomo.pinhole import Intrinsics
 from slomo.prior.clip import CENTRES, view_over_clip
+from slomo.prior.evidence import travelled
 from slomo.prior.travel import view_of_travel
 from slomo.raycast import look_at
 
@@ -65,6 +66,13 @@ def test_who_goes_somewhere_faces_there(velocity, azimuth):
 def test_who_stands_says_nothing():
     _, p, _ = walked(np.zeros((T, 2)), jitter=0.5)
     assert p.max() < 2 / 36
+
+
+def test_what_travel_tells_of_who_walks_and_who_stands():
+    _, walks, _ = walked(np.outer(t - t.mean(), [1.2, 0.0]), eye=(0, -9, 1.5))
+    _, stands, _ = walked(np.zeros((T, 2)), jitter=0.5)
+    assert travelled(walks).mean() > 0.7
+    assert travelled(stands).mean() < 0.1
 
 
 def test_a_doubtful_path_says_little():
