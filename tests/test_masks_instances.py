@@ -198,6 +198,16 @@ def test_shared_motion():
     assert motion.liveliness(6, animal[6]) > 1 > motion.liveliness(6, still[6])
 
 
+def test_what_a_body_has_for_as_long_as_it_is_seen_is_its_own_though_it_does_not_move():
+    things = [(post, lambda t: 150.0, GREY), (body, lambda t: 60 + 2.0 * t, RED)]
+    frames, (still, animal) = scene(12, things)
+    motion = SharedMotion(dense_flow(frames))
+    with_it = {t: animal[t] | still[t] for t in (0, 6, 11)}
+    assert motion.lasting(6, still[6], with_it)[still[6]].mean() > 0.9
+    passed = with_it | {11: animal[11]}
+    assert motion.lasting(6, still[6], passed).sum() < 0.1 * still[6].sum()
+
+
 def test_a_little_motion_is_enough_before_a_camera_that_stands_still():
     things = [(post, lambda t: 150.0, GREY), (body, lambda t: 60 + 0.25 * t, RED)]
     frames, (still, animal) = scene(12, things)

@@ -1,6 +1,8 @@
 """What of a picture shares the subject's motion against the background: neither a box that it walks past, nor a post in
 front of it, nor an animal that goes another way."""
 
+from collections.abc import Mapping
+
 import cv2
 import numpy as np
 
@@ -82,6 +84,16 @@ class SharedMotion:
         pieces.sort(key=lambda piece: -float(size[piece].sum()))
         whole = lambda m: cv2.resize(m.astype(np.uint8), self._flow.size, interpolation=cv2.INTER_NEAREST) > 0  # noqa: E731
         return [whole(piece) for piece in pieces[:3]]
+
+    def lasting(self, t: int, patch: np.ndarray, bodies: Mapping[int, np.ndarray]) -> np.ndarray:
+        """(H, W) bool, what of a patch (H, W) in frame t lies in the body (H, W) bool of every frame of `bodies`, where
+        the flow carries it there."""
+        small = cv2.resize(patch.astype(np.uint8), self._size, interpolation=cv2.INTER_NEAREST) > 0
+        for k, body in bodies.items():
+            if k != t and small.any():
+                there = cv2.resize(body.astype(np.float32), self._size, interpolation=cv2.INTER_AREA)
+                small &= sample(there, self._chain(t, k)) > 0.5
+        return patch & (cv2.resize(small.astype(np.uint8), self._flow.size, interpolation=cv2.INTER_NEAREST) > 0)
 
     def _inside(self, t: int, mask: np.ndarray) -> np.ndarray:
         """(n, 2) what of the residual is known and lies in (H, W) bool."""

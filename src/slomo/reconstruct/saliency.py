@@ -97,10 +97,11 @@ class SaliencySegmenter:
             seed = self.choice.frame
             subject = self._pointed_at(frames[seed], whole[seed])
         else:
-            bodies = {}
-            for t, p in whole.items():
-                body = component_at(p > 0.5)
-                bodies[t] = component_at(body & ~foreign(body, body, motion.share(t, motion.velocity(t, body))))
+            found, bodies = {t: component_at(p > 0.5) for t, p in whole.items()}, {}
+            for t, body in found.items():
+                calm = foreign(body, body, motion.share(t, motion.velocity(t, body)))
+                # What it passes it leaves behind, or it stands out no more: its own legs stay with it.
+                bodies[t] = component_at(body & ~(calm & ~motion.lasting(t, calm, found)))
             speed = {t: min(float(np.linalg.norm(motion.velocity(t, b))), _FAST) for t, b in bodies.items()}
             if max(speed.values()) < MOVES:  # what stands out is furniture, or rests
                 for t in probes:
