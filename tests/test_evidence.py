@@ -354,3 +354,15 @@ def test_the_same_gait_half_a_stride_later_goes_into_the_final(scene: Scene):
     assert [label["phase"] for label in chosen.labels] == [0.1, 0.6]
     alone = fit._to_final(problem, run, torch.tensor([1.0, 1.001, 1.1]))
     assert [label["phase"] for label in alone.labels] == [0.1]
+
+
+@pytest.mark.parametrize(("travelled", "walk", "wins"), [(3.0, 1.03, "walk"), (3.0, 1.06, "none"), (0.3, 1.03, "none")])
+def test_who_travels_takes_steps_unless_it_looks_much_better_without(scene: Scene, travelled, walk, wins):
+    labels = [{"gait": "none", "loss": 1.0}, {"gait": "walk", "loss": walk}]
+    x = {k: v.repeat(2, *[1] * (v.ndim - 1)) for k, v in scene.x.items()}
+    run = Run(3, x, join([_guess(phase=0.1)] * 2), labels, {"final": list(labels)})
+    root = hypotheses.RootGuess(np.zeros((T, 2)), LENGTH, np.zeros(T), travelled, np.ones(T))
+    effort = fit.Effort((Schedule(0, 1, 2, ()),), 8, 12)  # no time for limbs
+    best = fit._to_limbs(scene.problem(None, {"mask": 1.0}), run, torch.tensor([1.0, walk]), root, effort)
+    assert [label["gait"] for label in best.labels] == [wins]
+    assert best.log["final"][0]["gait"] == wins

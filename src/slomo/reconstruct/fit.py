@@ -21,6 +21,7 @@ from slomo.stage import Progress
 Tensor = torch.Tensor
 
 TIE = 0.03  # a rival whose loss is higher by this share may still win in the end
+STEPS = 0.04  # share by which the loss without a gait must be lower over more than a body length
 ELSEWHERE = 0.1  # body lengths between the feet of two hypotheses that move their legs otherwise, on average
 _MOTION = ("gait", "legs")
 PHASES = ("heading", "gait", "rivals", "final", "limbs")
@@ -232,7 +233,9 @@ def _feet_apart(problem: Problem, run: Run, one: int) -> Tensor:
 
 def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, *_) -> Run:
     """The best one goes on, beside it with limbs that are where they are seen better by now, where any are and there is
-    time for it."""
+    time for it. Somebody who travels takes steps: legs that do not must look better by `STEPS`."""
+    if root.travelled > 1:
+        losses = losses * torch.tensor([1 + STEPS * (label["gait"] == "none") for label in run.labels])
     best = _winner(run, losses)
     found = None
     if problem.kin.skeleton.kind == "quadruped" and effort.schedules[-1].iterations:
