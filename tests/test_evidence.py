@@ -350,10 +350,14 @@ def test_the_same_gait_half_a_stride_later_goes_into_the_final(scene: Scene):
     x = {k: v.repeat(3, *[1] * (v.ndim - 1)) for k, v in scene.x.items()}
     run = Run(2, x, join(poses), labels)
     problem = scene.problem(None, {"mask": 1.0})
-    chosen = fit._to_final(problem, run, torch.tensor([1.0, 1.001, 1.01]))
+    chosen = fit._to_final(problem, run, torch.tensor([1.0, 1.001, 1.01]), _went(3.0))
     assert [label["phase"] for label in chosen.labels] == [0.1, 0.6]
-    alone = fit._to_final(problem, run, torch.tensor([1.0, 1.001, 1.1]))
+    alone = fit._to_final(problem, run, torch.tensor([1.0, 1.001, 1.1]), _went(3.0))
     assert [label["phase"] for label in alone.labels] == [0.1]
+
+
+def _went(travelled: float) -> hypotheses.RootGuess:
+    return hypotheses.RootGuess(np.zeros((T, 2)), LENGTH, np.zeros(T), travelled, np.ones(T))
 
 
 @pytest.mark.parametrize(("travelled", "walk", "wins"), [(3.0, 1.03, "walk"), (3.0, 1.06, "none"), (0.3, 1.03, "none")])
@@ -361,7 +365,7 @@ def test_who_travels_takes_steps_unless_it_looks_much_better_without(scene: Scen
     labels = [{"gait": "none", "loss": 1.0}, {"gait": "walk", "loss": walk}]
     x = {k: v.repeat(2, *[1] * (v.ndim - 1)) for k, v in scene.x.items()}
     run = Run(3, x, join([_guess(phase=0.1)] * 2), labels, {"final": list(labels)})
-    root = hypotheses.RootGuess(np.zeros((T, 2)), LENGTH, np.zeros(T), travelled, np.ones(T))
+    root = _went(travelled)
     effort = fit.Effort((Schedule(0, 1, 2, ()),), 8, 12)  # no time for limbs
     best = fit._to_limbs(scene.problem(None, {"mask": 1.0}), run, torch.tensor([1.0, walk]), root, effort)
     assert [label["gait"] for label in best.labels] == [wins]

@@ -212,15 +212,23 @@ def _to_rivals(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
     return Run(2, x, join([guess, *(g for _, g in more.values())]), labels, run.log)
 
 
-def _to_final(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
+def _to_final(problem: Problem, run: Run, losses: Tensor, root: RootGuess, *_) -> Run:
     """The best one goes on, and with it the best that moves its legs otherwise if it is as good but for `TIE`: by what
     it was made of, or by where its feet are (one gait half a stride later is its left-right opposite)."""
+    losses = _stepping(run, losses, root)
     order = losses.argsort().tolist()
     own = run.labels[order[0]]
     away = _feet_apart(problem, run, order[0]).tolist()
     other = [k for k in order[1:] if away[k] > ELSEWHERE or any(run.labels[k].get(w) != own.get(w) for w in _MOTION)]
     which = torch.tensor(order[:1] + [k for k in other[:1] if losses[k] < (1 + TIE) * losses[order[0]]])
     return Run(3, pick(run.x, which), run.guess.pick(which), [run.labels[int(k)] for k in which], run.log)
+
+
+def _stepping(run: Run, losses: Tensor, root: RootGuess) -> Tensor:
+    """(H,) losses to compare by. Somebody who travels takes steps: legs without a gait must look better by `STEPS`."""
+    if root.travelled <= 1:
+        return losses
+    return losses * torch.tensor([1 + STEPS * (label["gait"] == "none") for label in run.labels])
 
 
 def _feet_apart(problem: Problem, run: Run, one: int) -> Tensor:
@@ -233,10 +241,8 @@ def _feet_apart(problem: Problem, run: Run, one: int) -> Tensor:
 
 def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, *_) -> Run:
     """The best one goes on, beside it with limbs that are where they are seen better by now, where any are and there is
-    time for it. Somebody who travels takes steps: legs that do not must look better by `STEPS`."""
-    if root.travelled > 1:
-        losses = losses * torch.tensor([1 + STEPS * (label["gait"] == "none") for label in run.labels])
-    best = _winner(run, losses)
+    time for it."""
+    best = _winner(run, _stepping(run, losses, root))
     found = None
     if problem.kin.skeleton.kind == "quadruped" and effort.schedules[-1].iterations:
         found = limb_track.by_limb(problem, best.x, best.guess, leave=limb_track.LIKELY)
