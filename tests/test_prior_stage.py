@@ -453,3 +453,12 @@ def test_front_and_back_of_one_outline():
     view[0, 2], view[1, 9] = 1, 1
     assert front_to_back(view).argmax(1).tolist() == [16, 9]
     assert np.array_equal(front_to_back(front_to_back(view)), view)
+
+
+@pytest.mark.parametrize("kind", ["quadruped", "human"])
+def test_slomo_s_own_network_is_asked_for_both_kinds(kind):
+    from slomo.pipeline import _find_prior
+
+    path = _find_prior(kind)
+    assert path is not None
+    assert not Prior(path).misfit(labels(load_skeleton(kind)))

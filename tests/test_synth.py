@@ -114,6 +114,9 @@ def test_too_fast_is_one_line_for_the_user():
         truth(Config(speed=9.0))
     with pytest.raises(UsageError, match="valid: follow"):
         Config(camera="drone")
+    for speed in (-1.0, float("nan")):
+        with pytest.raises(UsageError, match="speed is"):
+            Config(speed=speed)
 
 
 def test_truth_is_deterministic_and_depends_on_the_seed():

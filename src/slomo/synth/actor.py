@@ -101,11 +101,8 @@ def _person(_: str, move: str, t: Array, speed: float | None, turn: float, seed:
     names = skeleton.names
 
     def skin() -> Skin:
-        B = skeleton.link_count
-        colors = creature.colors(np.random.default_rng([seed, 2]))
-        return Skin(
-            creature.triangles, colors, lambda i: height * creature.skin(motion.R[i], motion.nodes[i, :B])
-        )  # fmt: skip
+        colors, origin = creature.colors(np.random.default_rng([seed, 2])), motion.nodes[:, : skeleton.link_count]
+        return Skin(creature.triangles, colors, lambda i: height * creature.skin(motion.R[i], origin[i]))
 
     return Actor(
         "human", names, tuple(names[limb.contact] for limb in skeleton.limbs),

@@ -48,11 +48,11 @@ class Config:
     seed: int = 0
 
     def __post_init__(self):
-        known_animal = self.animal if self.animal in ACTORS else ACTORS[0]
-        for name, known in (("animal", ACTORS), ("gait", moves(known_animal)), ("camera", CAMERAS)):
+        for name, known in (("animal", ACTORS), ("gait", moves(self.animal)), ("camera", CAMERAS)):
             if getattr(self, name) not in known:
                 raise UsageError(f"no {name} {getattr(self, name)!r}", where="synth", valid=known)
-        for name, low, high in (("seconds", 0.2, 120), ("fps", 5, 240), ("width", 64, 3840), ("height", 64, 2160)):
+        ranges = dict(seconds=(0.2, 120), fps=(5, 240), width=(64, 3840), height=(64, 2160), speed=(0, 20))
+        for name, (low, high) in ranges.items():
             if not low <= getattr(self, name) <= high:
                 raise UsageError(f"{name} is {getattr(self, name)}", where="synth", valid=[f"{low} to {high}"])
         if self.width % 2 or self.height % 2:
