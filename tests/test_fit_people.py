@@ -1,5 +1,7 @@
 """People: the first pose of every frame, from drawn silhouettes of the skeleton itself."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,7 +13,7 @@ from slomo.reconstruct.evidence import gather
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.observations import observe
 from slomo.reconstruct.problem import Problem
-from slomo.reconstruct.trajectory import Trajectory
+from slomo.reconstruct.trajectory import Guess, Trajectory
 from slomo.skeleton import load_skeleton
 
 T, FPS, W, H = 24, 8.0, 80, 120
@@ -119,3 +121,30 @@ def test_only_a_back_costs(raising):
     draw = problem.draw(4, 20, torch.Generator().manual_seed(0))
     state = problem.state(x, hypotheses.placed(problem.kin, root, yaw), draw, stance_weight=0.0)
     assert losses.facing(state).tolist() == pytest.approx([0, 0, 1], abs=1e-4)
+
+
+def test_who_is_turned_around_is_the_reflection_in_depth(raising):
+    """Every node where its opposite was, reflected in the plane through the pelvis that faces the camera; twice is as
+    it was."""
+    problem, root = raising
+    kin, every = problem.kin, torch.arange(T)
+    generator = torch.Generator().manual_seed(1)
+    guess = hypotheses.placed(kin, root, np.linspace(TOWARDS_CAMERA - 0.4, TOWARDS_CAMERA + 0.9, T)[None])
+    guess = replace(guess, q=0.3 * torch.randn(guess.q.shape, generator=generator), lean=guess.lean + 0.1)
+    x = problem.variables(1, generator)
+    x = {k: v + 0.05 * torch.randn(v.shape, generator=generator) if k[0] in "QG" else v for k, v in x.items()}
+    shape = {k.removeprefix("shape."): v for k, v in x.items() if k.startswith("shape.")}
+
+    def nodes(x: dict[str, torch.Tensor], guess: Guess) -> torch.Tensor:
+        return kin.pose(shape, *problem.path(x, guess, torch.ones(1), every)).nodes[0]
+
+    once = hypotheses.turned_around(problem, x, guess)
+    before, after = nodes(x, guess), nodes(*once)
+    away = before[:, 0, :2] - torch.as_tensor(CENTRE[:2], dtype=torch.float32)
+    away = (away / away.norm(dim=-1, keepdim=True))[:, None]
+    reflected = before[:, kin.mirror].clone()
+    along = ((reflected - before[:, :1])[..., :2] * away).sum(-1, keepdim=True)
+    reflected[..., :2] -= 2 * along * away
+    torch.testing.assert_close(after, reflected, atol=1e-4, rtol=0)
+    assert (after - before).norm(dim=-1).max() > 0.2
+    torch.testing.assert_close(nodes(*hypotheses.turned_around(problem, *once)), before, atol=1e-4, rtol=0)

@@ -8,9 +8,10 @@ import pytest
 
 from slomo.errors import InvalidData, UsageError
 from slomo.reconstruct.flow import dense_flow
+from slomo.reconstruct.instances import Choice
 from slomo.reconstruct.motion_segment import border_distance
-from slomo.reconstruct.segment import component_at, frame_certainty, frame_quality, spans
-from slomo.reconstruct.stage import DecodeConfig, MasksConfig, pack, run_decode, run_masks, unpack
+from slomo.reconstruct.segment import Masks, component_at, frame_certainty, frame_quality, spans
+from slomo.reconstruct.stage import DecodeConfig, MasksConfig, _segmented, pack, run_decode, run_masks, unpack
 from slomo.reconstruct.still_segment import StillSegmenter, _trimmed
 from slomo.reconstruct.surroundings import give_back_patches
 from slomo.reconstruct.votes import vote_over_time
@@ -191,6 +192,24 @@ def test_still_segmenter_finds_what_a_network_would_miss():
     rests = np.uint8(np.clip(frames[:1] + rng.normal(0, 3, frames.shape), 0, 255))
     with pytest.raises(InvalidData, match="nothing"):
         run_masks(inputs(rests), MasksConfig(segmenter="still"), Silent())
+
+
+@pytest.mark.parametrize(("missed", "taken"), [(0.1, "network"), (0.4, "still")])
+def test_a_network_that_misses_much_of_what_differs_is_not_taken(missed: float, taken: str):
+    frames, truth = moving_disc(40, speed=3.0, camera=0.0)
+    rows = np.cumsum(truth.sum(2), 1) / np.maximum(truth.sum((1, 2)), 1)[:, None]
+    seen = truth & (rows > missed)[:, :, None]
+
+    class Network:
+        name = "network"
+
+        def segment(self, *_) -> Masks:
+            return Masks(seen, np.ones(len(seen)))
+
+    flow = dense_flow(frames)
+    segmenter, found = _segmented(Network(), MasksConfig(), Choice(), frames, flow, Silent())
+    assert segmenter.name == taken
+    assert iou(found.masks, truth).mean() > 0.85
 
 
 def test_still_segmenter_keeps_a_foot_whose_leg_looks_like_the_ground():

@@ -8,7 +8,8 @@ import torch
 
 from slomo.pinhole import Intrinsics
 from slomo.reconstruct.fit import _diverse
-from slomo.reconstruct.hypotheses import GaitHypothesis, stride_frequencies
+from slomo.reconstruct.hypotheses import GRAVITY, GaitHypothesis, gait_grid, stride_frequencies
+from slomo.skeleton import load_skeleton
 
 FPS, WIDTH, HEIGHT = 30.0, 96, 64
 
@@ -45,6 +46,22 @@ def test_frequencies_stay_within_the_range():
     found = stride_frequencies(seen(1.2), 0.9, 1.5)  # type: ignore[arg-type]
     assert found
     assert all(0.9 <= f <= 1.5 for f in found)
+
+
+def test_a_gait_is_tried_of_every_size_that_the_animal_may_have():
+    """A horse that trots slowly: were it as long as a middling dog, it would walk."""
+    skeleton, leg = load_skeleton("quadruped"), 0.75
+    trot = next(g for g in skeleton.gaits if g.name == "trot")
+    speed = (0.6 * trot.froude[0] * GRAVITY * leg / 1.6) ** 0.5  # of 1.6 m, as doubtful as speeds are
+
+    def tried(metres: float | None) -> set[str]:
+        grid = gait_grid(seen(1.2), skeleton, leg=leg, speed=speed, metres=metres, phases=4)  # type: ignore[arg-type]
+        return {g.name for g in grid}
+
+    assert "trot" in tried(1.6)
+    assert "trot" in tried(None)
+    assert "trot" not in tried(skeleton.typical_length)
+    assert "gallop" not in tried(None)
 
 
 def test_every_gait_is_tried_though_all_phases_of_another_rank_before_it():

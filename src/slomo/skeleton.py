@@ -53,6 +53,7 @@ class Skeleton:
     """A skeleton at rest. Links are numbered root first, parents before children; nodes as in `names`.
 
     Attributes:
+        typical_length, lengths: m, of a middling body, and of the smallest and the largest that it stands for.
         names: M node names, links first (node j < B is the origin of link j), then points.
         link: (M,) link to which the node is fixed; for a joint the parent's link; -1 for the root.
         offset: (M, 3) of the node in that link's frame, body lengths.
@@ -69,6 +70,7 @@ class Skeleton:
     name: str
     kind: str
     typical_length: float
+    lengths: tuple[float, float]
     length_between: tuple[str, ...]
     names: tuple[str, ...]
     link_count: int
@@ -244,6 +246,9 @@ def _build(d: Mapping[str, Any], where: str) -> Skeleton:
         name=str(d["name"]),
         kind=str(d["kind"]),
         typical_length=float(d["typical_length"]),
+        lengths=(float(d["lengths"][0]), float(d["lengths"][1]))
+        if "lengths" in d
+        else (float(d["typical_length"]),) * 2,
         length_between=tuple(names[number(n, names, "length_between")] for n in d["length_between"]),
         names=tuple(names),
         link_count=len(links),

@@ -23,7 +23,7 @@ Tensor = torch.Tensor
 TIE = 0.03  # a rival whose loss is higher by this share may still win in the end
 STEPS = 0.04  # share by which the loss without a gait must be lower over more than a body length
 ELSEWHERE = 0.1  # body lengths between the feet of two hypotheses that move their legs otherwise, on average
-_MOTION = ("gait", "legs")
+_MOTION = ("gait", "legs", "seen")
 PHASES = ("heading", "gait", "rivals", "final", "limbs")
 FINAL = PHASES.index("final")  # from there on little is between two hypotheses, and many draws tell them apart
 
@@ -37,11 +37,13 @@ class Effort:
     phases_of_gait: int
 
 
-def fit(problem: Problem, root: RootGuess, effort: Effort, *, metres: float, seed: int, progress: Progress) -> Run:
+def fit(
+    problem: Problem, root: RootGuess, effort: Effort, *, metres: float | None, seed: int, progress: Progress
+) -> Run:
     """Fit from the root path to the winner.
 
     Args:
-        metres: wanted body length m, for Froude numbers.
+        metres: body length m, for Froude numbers; None: not known.
         seed: of the draws and of the MLPs' first layers.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -101,7 +103,13 @@ def total_cost(effort: Effort) -> float:
 
 
 def _to_gait(
-    problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, metres: float, progress: Progress
+    problem: Problem,
+    run: Run,
+    losses: Tensor,
+    root: RootGuess,
+    effort: Effort,
+    metres: float | None,
+    progress: Progress,
 ) -> Run:
     """Lay postures and gaits over the best heading (two when close), rank them as they are, keep the best few."""
     order = losses.argsort()
@@ -111,7 +119,7 @@ def _to_gait(
     rest = skeleton.rest()
     leg = float(np.mean([rest[limb.swing, 2] - rest[limb.contact, 2] for limb in skeleton.limbs]))
     speed = float(np.median(root.speed))
-    grid = hypotheses.gait_grid(obs, skeleton, leg=leg * metres, speed=speed * metres, phases=effort.phases_of_gait)
+    grid = hypotheses.gait_grid(obs, skeleton, leg=leg, speed=speed, metres=metres, phases=effort.phases_of_gait)
     run.log["stride_candidates_hz"] = sorted({round(g.frequency, 3) for g in grid})
     t = obs.t.numpy()
     entries: list[tuple[float, int, GaitHypothesis, Guess]] = []
@@ -191,24 +199,26 @@ def _diverse(entries: list, count: int) -> list:
     return out
 
 
-def _to_rivals(problem: Problem, run: Run, losses: Tensor, *_) -> Run:
+def _to_rivals(problem: Problem, run: Run, losses: Tensor, root: RootGuess, *_) -> Run:
     """The two best go on; the best of another gait than the best one's, because a motion without a gait falls faster
-    at first and less far; the best one with its left and right legs exchanged, because silhouettes hardly tell the
-    two apart and none of the others need be its opposite; and the best one with limbs that are elsewhere for a while,
-    where they would be seen better there."""
+    at first and less far; the best one with its left and right legs exchanged (of a person who stays in place, turned
+    around), because silhouettes hardly tell the two apart and none of the others need be its opposite; and the best
+    one with limbs that are elsewhere for a while, where they would be seen better there."""
     order = losses.argsort().tolist()
     other = [k for k in order if run.labels[k]["gait"] != run.labels[order[0]]["gait"]]
     which = torch.tensor(list(dict.fromkeys(order[:2] + other[:1])))
     best = which[:1]
     x, guess = pick(run.x, which), run.guess.pick(which)
-    more = {"exchanged": hypotheses.exchanged(problem, pick(run.x, best), run.guess.pick(best))}
-    if problem.kin.skeleton.kind == "quadruped":
-        found = limb_track.by_limb(problem, pick(run.x, best), run.guess.pick(best), leave=limb_track.PLAINLY)
-        if found is not None:
-            more["on their own"] = found
+    kind, own = problem.kin.skeleton.kind, (problem, pick(run.x, best), run.guess.pick(best))
+    if kind == "human" and root.travelled <= 1:
+        more = {("seen", "turned around"): hypotheses.turned_around(*own)}
+    else:
+        more = {("legs", "exchanged"): hypotheses.exchanged(*own)}
+    if kind == "quadruped" and (found := limb_track.by_limb(*own, leave=limb_track.PLAINLY)) is not None:
+        more["legs", "on their own"] = found
     x = {k: torch.cat([v, *(other[k] for other, _ in more.values())]) for k, v in x.items()}
     labels = [run.labels[int(k)] for k in which]
-    labels += [labels[0] | {"legs": name} for name in more]
+    labels += [labels[0] | {key: value} for key, value in more]
     return Run(2, x, join([guess, *(g for _, g in more.values())]), labels, run.log)
 
 

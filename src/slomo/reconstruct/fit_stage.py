@@ -21,7 +21,7 @@ from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import Skeleton, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 23
+FIT_VERSION = 24
 
 AGAIN = 0.5  # share of the rates with which the winner is fitted once more, beside one with other limbs
 POLISH = 0.4  # share of the rates with which the chunks of a long clip are polished together
@@ -72,7 +72,7 @@ class FitConfig:
     weight_forward: float = 0.25
     weight_balance: float = 0.01
     weight_prior: float = 0.05
-    weight_facing: float = 0.05
+    weight_facing: float = 0.02
     weight_view: float = 0.05
     weight_keypoints: float = 0.5
     weight_parts: float = 0.25
@@ -166,7 +166,9 @@ def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
 
 def _search(made: Prepared, config: FitConfig, progress: Progress) -> Run:
     root = hypotheses.root_guess(made.problem.obs, made.skeleton)
-    return fitting.fit(made.problem, root, _effort(config), metres=made.metres, seed=config.seed, progress=progress)
+    return fitting.fit(
+        made.problem, root, _effort(config), metres=config.length_m or None, seed=config.seed, progress=progress
+    )
 
 
 def _long(

@@ -128,6 +128,24 @@ def exchanged(problem: Problem, x: Variables, guess: Guess) -> tuple[Variables, 
     return x, replace(guess, q=q)
 
 
+def turned_around(problem: Problem, x: Variables, guess: Guess) -> tuple[Variables, Guess]:
+    """The same motion reflected in depth, as a guess with no corrections to it: a body that faces the camera as one
+    that turns its back to it, with left and right exchanged. From afar the two have the same silhouettes and flow."""
+    x, guess = as_guess(problem, x, guess)
+    every = torch.arange(len(problem.obs.t))
+    with torch.no_grad():
+        position, R, q = problem.path(x, guess, x["shape.log_length"].exp(), every)
+        _, centre = problem.cameras(x["tilt"], every)
+    last = max(k for k in x if k.startswith("G.w")).removeprefix("G.w")
+    x = x | {k: torch.zeros_like(x[k]) for k in (f"G.w{last}", f"G.b{last}")}
+    away = position - centre
+    yaw, pitch = torch.atan2(R[..., 1, 0], R[..., 0, 0]), torch.asin(-R[..., 2, 0].clamp(-1, 1))
+    roll = torch.atan2(R[..., 2, 1], R[..., 2, 2])
+    yaw = 2 * torch.atan2(away[..., 1], away[..., 0]) + math.pi - yaw
+    q = q[:, :, problem.kin.mirror[: problem.kin.B]] * torch.tensor([-1.0, 1.0, -1.0])
+    return x, replace(guess, position=position, yaw=yaw, lean=torch.stack([pitch, -roll], -1), q=q)
+
+
 def limb_links(skeleton: Skeleton, limb: Limb) -> list[int]:
     """The limb's links, from the one that its swing joint moves outwards."""
     out = []
@@ -187,19 +205,22 @@ def stride_frequencies(obs: Observations, low: float, high: float) -> list[float
     return out
 
 
-def gait_grid(obs: Observations, skeleton: Skeleton, *, leg: float, speed: float, phases: int) -> list[GaitHypothesis]:
+def gait_grid(
+    obs: Observations, skeleton: Skeleton, *, leg: float, speed: float, metres: float | None, phases: int
+) -> list[GaitHypothesis]:
     """All gaits that fit the speed, with the clip's stride frequencies and `phases` phases each.
 
     Args:
-        leg: leg length m. speed: median speed m/s. Both metric, for the Froude number and the range of frequencies.
+        leg: leg length, body lengths. speed: median speed, body lengths / s.
+        metres: body length m, if it is known; else any that the skeleton stands for may be.
     """
-    natural = math.sqrt(GRAVITY / leg) / (2 * math.pi)
-    froude = speed**2 / (GRAVITY * leg)
+    natural = math.sqrt(GRAVITY / (leg * (metres or skeleton.typical_length))) / (2 * math.pi)
+    slowest, fastest = (m * speed**2 / (GRAVITY * leg) for m in ((metres, metres) if metres else skeleton.lengths))
     frequencies = stride_frequencies(obs, 0.5 * natural, 5.5 * natural)
     out = []
     for gait in skeleton.gaits:
-        # Speed is uncertain (scale, path): a factor of two each way in the Froude number.
-        if not gait.froude[0] / 2 <= froude <= gait.froude[1] * 2:
+        # Speed is uncertain (length, path): a factor of two each way in the Froude number.
+        if not (gait.froude[0] / 2 <= fastest and slowest <= gait.froude[1] * 2):
             continue
         for f, stretches in zip(frequencies, _STRETCHES, strict=False):
             for stretch in stretches:

@@ -98,8 +98,11 @@ def _swap_margin(log: dict) -> float | None:
     chosen = _named(log["final"][0])
     rivals = [(_named(e), e["loss"]) for e in log["rivals"]]
     own = next(loss for name, loss in rivals if name == chosen)
-    flip = {k: v for k, v in chosen.items() if k != "legs"} | ({} if "legs" in chosen else {"legs": "exchanged"})
-    other = [loss for name, loss in rivals if name == flip]
+    flips = [
+        {k: v for k, v in chosen.items() if k != key} if key in chosen else chosen | {key: value}
+        for key, value in (("legs", "exchanged"), ("seen", "turned around"))
+    ]
+    other = [loss for name, loss in rivals if name in flips]
     if not other and chosen.get("gait", "none") != "none":
         own = next(e["loss"] for e in log["gait"] if _named(e) == chosen)
         other = [

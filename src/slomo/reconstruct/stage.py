@@ -13,13 +13,14 @@ from slomo.reconstruct.video import decode
 from slomo.stage import Artifact, Inputs, Progress
 
 DECODE_VERSION = 2
-MASKS_VERSION = 11
+MASKS_VERSION = 12
 CAMERA_VERSION = 7
 QUALITIES = ("draft", "normal", "high")
 
 SEGMENTERS = ("auto", "u2netp", "still", "motion", "user")
 _LOST = 0.05  # part of the frames without the subject, from which on the other masks are taken
 _SURE = 0.8  # mean quality over all frames, below which they are
+_MISSED, _ELSE = 0.2, 0.05  # parts of the other masks that these do not have, and of these that the others do not
 
 
 @dataclass(frozen=True)
@@ -233,7 +234,8 @@ def _segmented(segmenter, config: MasksConfig, choice, frames: np.ndarray, flow,
     """The segmenter whose masks are taken, and its masks.
 
     Before a camera that stands still, "auto" looks at what differs from the picture without the subject as well, and
-    takes that where the other finds nobody, loses the subject or is not sure of it: networks miss what is small.
+    takes that where the other finds nobody, loses the subject or is not sure of it, or has a part of what differs and
+    hardly anything else: networks miss what is small, and legs or a head of another colour.
     """
     from slomo.reconstruct.segment import frame_quality
     from slomo.reconstruct.still_segment import StillSegmenter, stands_still
@@ -254,7 +256,9 @@ def _segmented(segmenter, config: MasksConfig, choice, frames: np.ndarray, flow,
         return still, other
     lost = other.masks.any((1, 2)) & ~found.masks.any((1, 2))
     sure = frame_quality(found.masks, flow, found.certainty).mean()
-    return (still, other) if lost.mean() > _LOST or sure < _SURE else (segmenter, found)
+    part = (found.masks & other.masks).sum() / np.array([found.masks.sum(), other.masks.sum()])
+    missed = part[0] > 1 - _ELSE and part[1] < 1 - _MISSED
+    return (still, other) if lost.mean() > _LOST or sure < _SURE or missed else (segmenter, found)
 
 
 def _segmenter(inputs: Inputs, config: MasksConfig, choice):
