@@ -112,6 +112,18 @@ def test_a_small_animal_among_large_things_before_a_camera_that_stands_still():
     assert iou(found.masks, animal).mean() > 0.85
 
 
+def test_what_an_animal_walks_up_to_is_not_the_animals():
+    """It touches a thing as large as itself in a third of the clip, and moves little."""
+
+    def feeder(x, y):
+        return (abs(x) < 24) & (y > 28) & (y < 95)
+
+    things = [(feeder, lambda t: 150.0, GREY), (body, lambda t: 93.5 + 0.25 * t, RED)]
+    frames, (_, animal) = scene(40, things)
+    found = segment(frames)
+    assert iou(found.masks, animal).min() > 0.8
+
+
 def test_a_box_picks_and_an_empty_place_says_so():
     things = [(small_body, lambda t: 170 + 0.5 * t, GREEN), (body, lambda t: 50 + 1.0 * t, RED)]
     frames, (right, left) = scene(16, things)

@@ -18,6 +18,7 @@ _LOST = 64.0  # px, a motion that flow cannot have followed
 _ASTRAY = 1.5  # px, median motion of the whole picture, from which on the homography has not been found
 _BENDS = 1.5  # px of motion that no flat thing has, from which on a body is said to be alive
 _CALM = 0.3, 0.45  # px as a whole and of bending, likewise before a camera that stands still, where things have 0.06
+_ALIKE = 10.0  # levels of RGB, between two frames of a thing that is still the same
 _KEPT = 64  # frames whose motion is remembered
 _STILL = 0.3  # px of the median motion, below which the camera stands still and nothing has parallax
 
@@ -94,6 +95,35 @@ class SharedMotion:
                 there = cv2.resize(body.astype(np.float32), self._size, interpolation=cv2.INTER_AREA)
                 small &= sample(there, self._chain(t, k)) > 0.5
         return patch & (cv2.resize(small.astype(np.uint8), self._flow.size, interpolation=cv2.INTER_NEAREST) > 0)
+
+    def apart(
+        self, t: int, frames: np.ndarray, bodies: Mapping[int, np.ndarray], others: Mapping[int, np.ndarray]
+    ) -> np.ndarray:
+        """(H, W) bool, what of the body in frame t is no part of it: a box that it touches now. In another frame of
+        `bodies` it is seen again, looking the same and where the flow carries it, but as one of two things apart: the
+        body there and what stands out beside it, `others`. The less lively of the two is not the body."""
+        small = lambda m: cv2.resize(m.astype(np.float32), self._size, interpolation=cv2.INTER_AREA)  # noqa: E731
+        here, body = small(frames[t]), small(bodies[t]) > 0.5
+        again = np.zeros((2, *body.shape), bool)
+        for k in bodies:
+            if k != t and others[k].any():
+                there = self._chain(t, k)
+                alike = np.abs(sample(small(frames[k]), there) - here).mean(-1) < _ALIKE
+                again |= [alike & (sample(small(m[k]), there) > 0.5) for m in (others, bodies)]
+        radius = max(2, round(0.07 * np.sqrt(max(body.sum(), 1))))  # wider than a leg
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+        patches = []
+        for seen in again:
+            core = cv2.morphologyEx((body & seen).astype(np.uint8), cv2.MORPH_OPEN, disc)
+            patch = cv2.resize(cv2.dilate(core, np.ones((5, 5), np.uint8)), self._flow.size) > 0
+            patches.append(bodies[t] & patch)
+        other, own = patches
+        if other.any():
+            if self.liveliness(t, other) < 0.5 * self.liveliness(t, bodies[t] & ~other):
+                return other
+            if own.any() and self.liveliness(t, own) < 0.5 * self.liveliness(t, other):
+                return own
+        return np.zeros_like(bodies[t])
 
     def _inside(self, t: int, mask: np.ndarray) -> np.ndarray:
         """(n, 2) what of the residual is known and lies in (H, W) bool."""

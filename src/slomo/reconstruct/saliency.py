@@ -7,15 +7,7 @@ import numpy as np
 from slomo.reconstruct.flow import Flow, sample
 from slomo.reconstruct.instances import Choice, Look, components, distance, tell_apart
 from slomo.reconstruct.instances_motion import MOVES, SharedMotion, foreign
-from slomo.reconstruct.segment import (
-    Masks,
-    Report,
-    box_of,
-    component_at,
-    frame_certainty,
-    grown,
-    no_subject,
-)
+from slomo.reconstruct.segment import Masks, Report, box_of, component_at, frame_certainty, grown, no_subject
 from slomo.reconstruct.surroundings import give_back_patches, give_back_surroundings
 from slomo.reconstruct.u2net import U2Net
 from slomo.reconstruct.votes import vote_over_time
@@ -98,6 +90,8 @@ class SaliencySegmenter:
             subject = self._pointed_at(frames[seed], whole[seed])
         else:
             found, bodies = {t: component_at(p > 0.5) for t, p in whole.items()}, {}
+            beside = {t: (whole[t] > 0.5) & ~body for t, body in found.items()}
+            found = {t: component_at(b & ~motion.apart(t, frames, found, beside)) for t, b in found.items()}
             for t, body in found.items():
                 calm = foreign(body, body, motion.share(t, motion.velocity(t, body)))
                 # What it passes it leaves behind, or it stands out no more: its own legs stay with it.
