@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from slomo.errors import UsageError
-from slomo.reconstruct import chunks, evidence_terms, hypotheses, losses
+from slomo.reconstruct import chunks, evidence_terms, hypotheses, losses, seams
 from slomo.reconstruct import fit as fitting
 from slomo.reconstruct.evidence import Evidence, gather
 from slomo.reconstruct.kinematics import Kinematics
@@ -175,14 +175,19 @@ def _long(
     inputs: Inputs, made: Prepared, where: Sequence[tuple[int, int]], config: FitConfig, progress: Progress
 ) -> Run:
     """Each chunk by itself, and then all of them together from what they found."""
+
+    def part(n: int) -> Prepared:
+        cut = prepare(chunks.cut(inputs, *where[n]), config)
+        return replace(cut, problem=chunks.level(cut.problem))
+
     progress.note(f"fit: a long clip, in {len(where)} chunks that overlap")
     runs = chunks.finished(progress)
     while len(runs) < len(where):
-        part = prepare(chunks.cut(inputs, *where[len(runs)]), config)
-        part = replace(part, problem=chunks.level(part.problem))
-        runs.append(_search(part, config, chunks.ChunkProgress(progress, runs, len(where))))
+        runs.append(_search(part(len(runs)), config, chunks.ChunkProgress(progress, runs, len(where))))
+    runs, exchanged = seams.settle(lambda n: part(n).problem, runs, where)
     paths = [_path(made.problem.obs.t[a:b], made.problem.kin, config) for a, b in where]
     joined = chunks.join(made.problem, paths, runs, where)
+    joined.log["seams"] = exchanged
     schedule = replace(_effort(config).schedules[fitting.FINAL], rate=POLISH)
     last = chunks.ChunkProgress(progress, runs, len(where))
     return fitting.polish(made.problem, joined, schedule, seed=config.seed, progress=last)

@@ -1,0 +1,98 @@
+"""Where chunks of a long clip meet: legs that change places are found, and put right where the fit likes it best."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from slomo.reconstruct import hypotheses, seams
+from slomo.reconstruct.hypotheses import GaitHypothesis, RootGuess
+from slomo.reconstruct.kinematics import Kinematics
+from slomo.reconstruct.run import Run
+from slomo.reconstruct.trajectory import Guess, Trajectory
+from slomo.skeleton import load_skeleton
+
+KIN = Kinematics(load_skeleton("quadruped"))
+FPS, T = 15, 75
+WHERE = [(0, 45), (30, T)]  # frames of the two chunks
+HIND = torch.tensor([k for limb in KIN.skeleton.limbs if "hind" in limb.name
+                     for k in hypotheses.limb_links(KIN.skeleton, limb)])  # fmt: skip
+
+
+def motion() -> Guess:
+    """A walk."""
+    t = np.arange(T) / FPS
+    root = RootGuess(np.stack([0.8 * t, 0 * t], 1), 1.0, 0 * t, 4.0, np.full(T, 0.8))
+    walk = next(g for g in KIN.skeleton.gaits if g.name == "walk")
+    guess = hypotheses.placed(KIN, root, np.zeros((1, T)))
+    q, _ = hypotheses.gait_pose(KIN, walk, GaitHypothesis("walk", 0.9, 0.1), t, speed=root.speed, leg=0.75)
+    guess.q[0] = torch.as_tensor(q, dtype=torch.float32)
+    return guess
+
+
+def cut(guess: Guess, first: int, last: int) -> Guess:
+    return Guess(**{k: v[:, first:last].clone() for k, v in vars(guess).items()})
+
+
+def exchange(guess: Guess, first: int, last: int) -> None:
+    q = guess.q.clone()
+    guess.q[:, first:last, HIND] = q[:, first:last, KIN.mirror[HIND]] * torch.tensor([-1.0, 1.0, -1.0])
+
+
+@pytest.fixture
+def settled(monkeypatch):
+    """`settle` with a loss that is the distance of the joint angles from the truth."""
+    true = [cut(motion(), *w) for w in WHERE]
+
+    def rank(problem, x, guess: Guess, *, draws: int) -> torch.Tensor:
+        return (guess.q - true[problem.number].q).abs().mean((1, 2, 3))
+
+    def problem_of(n: int) -> SimpleNamespace:
+        t = torch.arange(*WHERE[n]) / FPS
+        path = Trajectory(t, KIN.B, joint_hz=4, root_hz=2, width=8)
+        return SimpleNamespace(number=n, kin=KIN, path=path, obs=SimpleNamespace(t=t))
+
+    def call(guesses: list[Guess]) -> tuple[list[Guess], list[dict]]:
+        runs = []
+        for n, guess in enumerate(guesses):
+            shape = {f"shape.{k}": v for k, v in KIN.shape_variables(1).items()}
+            moves = problem_of(n).path.variables(1, torch.Generator().manual_seed(0))
+            runs.append(Run(4, shape | moves | {"tilt": torch.zeros(1, 2)}, guess, [{}]))
+        out, log = seams.settle(problem_of, runs, WHERE)  # type: ignore[arg-type]
+        return [r.guess for r in out], log
+
+    monkeypatch.setattr(seams, "rank", rank)
+    return call, true
+
+
+def test_chunks_that_agree_stay_as_they_are(settled):
+    call, true = settled
+    found, log = call([cut(motion(), *w) for w in WHERE])
+    assert log == []
+    for f, g in zip(found, true, strict=True):
+        torch.testing.assert_close(f.q, g.q)
+
+
+@pytest.mark.parametrize("late", [True, False])
+def test_legs_that_change_places_at_a_seam_are_put_right(settled, late: bool):
+    """The later chunk begins with its hind legs exchanged, or the earlier one ends with them so."""
+    call, true = settled
+    wrong = [cut(motion(), *w) for w in WHERE]
+    exchange(wrong[late], *((0, 26) if late else (18, 45)))
+    found, log = call(wrong)
+    assert len(log) == 1
+    assert log[0]["limbs"] == "hind"
+    assert log[0]["chunk"] == 1 + late
+    torch.testing.assert_close(found[1 - late].q, true[1 - late].q)
+    before, after = ((g.q - true[late].q).abs().mean() for g in (wrong[late], found[late]))
+    assert after < 0.25 * before
+
+
+def test_a_chunk_that_is_wrong_all_through_is_exchanged_all_through(settled):
+    call, true = settled
+    wrong = [cut(motion(), *w) for w in WHERE]
+    exchange(wrong[1], 0, 45)
+    found, log = call(wrong)
+    assert log == [{"limbs": "hind", "exchanged_s": [2.0, round(74 / FPS, 3)], "chunk": 2}]
+    torch.testing.assert_close(found[1].q, true[1].q)
