@@ -15,7 +15,7 @@ Tensor = torch.Tensor
 
 HEIGHT = 0.06  # body lengths above its stance height at which a foot is as likely up as down
 SPEED = 0.35  # body lengths / s, likewise, of a body at rest
-TRAVEL = 0.3  # what is added to it of the body's own speed: a path that is wrong slides all feet with it
+TRAVEL = 0.2  # what is added to it of the body's own speed: a path that is wrong slides all feet with it
 SURE = 0.99  # of one frame at most
 CHANGES = 3.0  # how often a second a foot is expected to change between up and down
 # Inverse kinematics: s.d. of the corrections of a joint, rad about x (abduction), y (flexion: what legs do) and
