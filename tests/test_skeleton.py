@@ -108,6 +108,7 @@ def test_a_small_file_of_ones_own():
     assert s.names == ("pelvis", "left_hip", "right_hip", "left_toe", "right_toe")
     assert np.degrees(s.lower[2]) == pytest.approx([-10, -10, -20])
     assert [limb.name for limb in s.limbs] == ["left", "right"]
+    assert s.lengths == (1.0, 1.0)  # where the file does not say, all are as long as the middling one
 
 
 @pytest.mark.parametrize(
@@ -120,6 +121,8 @@ def test_a_small_file_of_ones_own():
         ('contact = "left_toe"', 'contact = "left_hand"', "names 'left_hand'"),
         ("radii = [0.1, 0.1]", "radii = [0.1", "is not TOML"),
         ("offset = [0, 0.1, 0]", 'offset = "far"', "has a wrong value"),
+        ("sole = 0.0", "sole = 0.0\nlengths = [2.0, 1.0]", "expected the smallest and the largest"),
+        ("sole = 0.0", "sole = 0.0\nlengths = [2.0]", "has a wrong value"),
     ],
 )
 def test_a_wrong_file_says_where(old: str, new: str, message: str):

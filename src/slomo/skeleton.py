@@ -242,13 +242,14 @@ def _build(d: Mapping[str, Any], where: str) -> Skeleton:
         other = _flip(name)
         return items.index(other) if other in items else items.index(name)
 
+    smallest, largest = (float(m) for m in d.get("lengths", [d["typical_length"]] * 2))
+    if not 0 < smallest <= largest:
+        raise InvalidData(f"lengths is {d['lengths']}, expected the smallest and the largest in m", where=where)
     return Skeleton(
         name=str(d["name"]),
         kind=str(d["kind"]),
         typical_length=float(d["typical_length"]),
-        lengths=(float(d["lengths"][0]), float(d["lengths"][1]))
-        if "lengths" in d
-        else (float(d["typical_length"]),) * 2,
+        lengths=(smallest, largest),
         length_between=tuple(names[number(n, names, "length_between")] for n in d["length_between"]),
         names=tuple(names),
         link_count=len(links),
