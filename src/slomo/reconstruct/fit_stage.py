@@ -72,7 +72,7 @@ class FitConfig:
     weight_forward: float = 0.25
     weight_balance: float = 0.01
     weight_prior: float = 0.05
-    weight_facing: float = 0.02
+    weight_facing: float = 0.012
     weight_view: float = 0.05
     weight_keypoints: float = 0.5
     weight_parts: float = 0.25
