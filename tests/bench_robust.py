@@ -74,7 +74,7 @@ def spoiled_masks(inputs: Inputs, rng: np.random.Generator) -> Inputs:
     print(f"  masks: IoU with the estimated ones {np.mean(both / either):.2f}", flush=True)
     packed = dict(z) | {"packed": np.packbits(worse, axis=-1)}
     frames = inputs.artifacts["decode"].npz["frames.npz"]["frames"]
-    npz = {"masks.npz": packed, "flow.npz": masks.npz["flow.npz"] | closer(frames, worse.astype(bool))}
+    npz = {"masks.npz": packed, "flow.npz": {**masks.npz["flow.npz"], **closer(frames, worse.astype(bool))}}
     return replace(inputs, artifacts={**inputs.artifacts, "masks": replace(masks, npz=npz)})
 
 

@@ -21,6 +21,7 @@ from slomo.stage import Progress
 Tensor = torch.Tensor
 
 TIE = 0.03  # a rival whose loss is higher by this share may still win in the end
+TURNED = 0.1  # the same of one that faces the other way: short fits say little of that
 STEPS = 0.04  # share by which the loss without a gait must be lower over more than a body length
 ELSEWHERE = 0.1  # body lengths between the feet of two hypotheses that move their legs otherwise, on average
 _MOTION = ("gait", "legs", "seen")
@@ -224,13 +225,15 @@ def _to_rivals(problem: Problem, run: Run, losses: Tensor, root: RootGuess, *_) 
 
 def _to_final(problem: Problem, run: Run, losses: Tensor, root: RootGuess, *_) -> Run:
     """The best one goes on, and with it the best that moves its legs otherwise if it is as good but for `TIE`: by what
-    it was made of, or by where its feet are (one gait half a stride later is its left-right opposite)."""
+    it was made of, or by where its feet are (one gait half a stride later is its left-right opposite). A person who is
+    turned around may be worse by more (`TURNED`)."""
     losses = _stepping(run, losses, root)
     order = losses.argsort().tolist()
     own = run.labels[order[0]]
     away = _feet_apart(problem, run, order[0]).tolist()
     other = [k for k in order[1:] if away[k] > ELSEWHERE or any(run.labels[k].get(w) != own.get(w) for w in _MOTION)]
-    which = torch.tensor(order[:1] + [k for k in other[:1] if losses[k] < (1 + TIE) * losses[order[0]]])
+    limit = {k: TIE if run.labels[k].get("seen") == own.get("seen") else TURNED for k in other}
+    which = torch.tensor(order[:1] + [k for k in other if losses[k] < (1 + limit[k]) * losses[order[0]]][:1])
     return Run(3, pick(run.x, which), run.guess.pick(which), [run.labels[int(k)] for k in which], run.log)
 
 
