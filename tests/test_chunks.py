@@ -6,6 +6,7 @@ import torch
 
 from slomo.reconstruct import chunks
 from slomo.reconstruct.fit_stage import prepare, run_fit
+from slomo.reconstruct.kinematics import yaw_pitch_roll
 from slomo.reconstruct.refine_stage import ReconstructConfig, run_refine
 from slomo.reconstruct.run import from_arrays
 from slomo.stage import Artifact, Inputs, Silent
@@ -66,7 +67,7 @@ def test_joined_chunks_move_as_the_chunks_did(walk, short):
     runs = []
     for (a, b), part in zip(where, parts, strict=True):  # each says what one fit of the whole says
         position, R, q = whole.path(one.x, one.guess, one.x["shape.log_length"].exp(), torch.arange(a, b))
-        yaw, pitch, roll = chunks._angles(R[0].numpy().astype(float))
+        yaw, pitch, roll = (a.numpy() for a in yaw_pitch_roll(R[0].double()))
         guess = one.guess.pick(torch.zeros(1, dtype=torch.long))
         f = lambda x: torch.as_tensor(x, dtype=torch.float32)[None]  # noqa: E731
         guess = type(guess)(position, f(yaw), f(np.stack([pitch, roll], -1)), q, guess.stance[:, a:b])

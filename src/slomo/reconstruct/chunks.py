@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from slomo.reconstruct.kinematics import yaw_pitch_roll
 from slomo.reconstruct.problem import Problem
 from slomo.reconstruct.run import Run, as_arrays, from_arrays
 from slomo.reconstruct.trajectory import Guess, Trajectory
@@ -121,7 +122,8 @@ def join(whole: Problem, paths: Sequence[Trajectory], runs: Sequence[Run], where
         n = last - first
         with torch.no_grad():
             position, R, q = path(run.x, run.guess, run.x["shape.log_length"].exp(), torch.arange(n))
-        yaw, pitch, roll = _angles(R[0].numpy().astype(float))
+        yaw, pitch, roll = (a.numpy() for a in yaw_pitch_roll(R[0].double()))
+        yaw = np.unwrap(yaw)
         if yaw_before is not None:
             yaw = yaw + 2 * np.pi * np.round((yaw_before[first] - yaw[0]) / (2 * np.pi))
         inner = np.minimum(np.arange(n) + 1, n - np.arange(n)).astype(float)
@@ -141,9 +143,3 @@ def join(whole: Problem, paths: Sequence[Trajectory], runs: Sequence[Run], where
     x |= {k: torch.stack([r.x[k] for r in runs]).mean(0) for k in x if k.startswith("shape.")}
     best = min(runs, key=lambda r: r.loss)
     return Run(best.phase, x, guess, [{**best.labels[0], "chunks": len(runs)}], best.log | log)
-
-
-def _angles(R: Array) -> tuple[Array, Array, Array]:
-    """Yaw (continuous), pitch, roll (T,) rad of R = Rz(yaw) Ry(pitch) Rx(roll)."""
-    yaw = np.unwrap(np.arctan2(R[:, 1, 0], R[:, 0, 0]))
-    return yaw, -np.arcsin(np.clip(R[:, 2, 0], -1, 1)), np.arctan2(R[:, 2, 1], R[:, 2, 2])

@@ -10,7 +10,7 @@ import torch
 
 from slomo.ground_path import ground_path
 from slomo.reconstruct.evidence import Evidence
-from slomo.reconstruct.kinematics import Kinematics
+from slomo.reconstruct.kinematics import Kinematics, yaw_pitch_roll
 from slomo.reconstruct.observations import Observations
 from slomo.reconstruct.problem import Problem, Variables
 from slomo.reconstruct.trajectory import Guess
@@ -114,9 +114,13 @@ def as_guess(problem: Problem, x: Variables, guess: Guess) -> tuple[Variables, G
     """The same motion as a guess with no corrections of the joint angles to it, and without hypothetical contacts."""
     with torch.no_grad():
         _, _, q = problem.path(x, guess, x["shape.log_length"].exp(), torch.arange(len(problem.obs.t)))
-    last = max(k for k in x if k.startswith("Q.w")).removeprefix("Q.w")
-    x = x | {k: torch.zeros_like(x[k]) for k in (f"Q.w{last}", f"Q.b{last}")}
-    return x, replace(guess, q=q, stance=torch.full_like(guess.stance, -1.0))
+    return _silent(x, "Q"), replace(guess, q=q, stance=torch.full_like(guess.stance, -1.0))
+
+
+def _silent(x: Variables, name: str) -> Variables:
+    """The variables with the last layer of the MLP `name` zero: it corrects nothing."""
+    last = max(k for k in x if k.startswith(f"{name}.w")).removeprefix(f"{name}.w")
+    return x | {k: torch.zeros_like(x[k]) for k in (f"{name}.w{last}", f"{name}.b{last}")}
 
 
 def exchanged(problem: Problem, x: Variables, guess: Guess) -> tuple[Variables, Guess]:
@@ -124,7 +128,7 @@ def exchanged(problem: Problem, x: Variables, guess: Guess) -> tuple[Variables, 
     x, guess = as_guess(problem, x, guess)
     kin, q = problem.kin, guess.q.clone()
     legs = torch.tensor(leg_links(kin.skeleton))
-    q[:, :, legs] = guess.q[:, :, kin.mirror[legs]] * torch.tensor([-1.0, 1.0, -1.0])
+    q[:, :, legs] = kin.mirrored(guess.q)[:, :, legs]
     return x, replace(guess, q=q)
 
 
@@ -136,14 +140,11 @@ def turned_around(problem: Problem, x: Variables, guess: Guess) -> tuple[Variabl
     with torch.no_grad():
         position, R, q = problem.path(x, guess, x["shape.log_length"].exp(), every)
         _, centre = problem.cameras(x["tilt"], every)
-    last = max(k for k in x if k.startswith("G.w")).removeprefix("G.w")
-    x = x | {k: torch.zeros_like(x[k]) for k in (f"G.w{last}", f"G.b{last}")}
     away = position - centre
-    yaw, pitch = torch.atan2(R[..., 1, 0], R[..., 0, 0]), torch.asin(-R[..., 2, 0].clamp(-1, 1))
-    roll = torch.atan2(R[..., 2, 1], R[..., 2, 2])
+    yaw, pitch, roll = yaw_pitch_roll(R)
     yaw = 2 * torch.atan2(away[..., 1], away[..., 0]) + math.pi - yaw
-    q = q[:, :, problem.kin.mirror[: problem.kin.B]] * torch.tensor([-1.0, 1.0, -1.0])
-    return x, replace(guess, position=position, yaw=yaw, lean=torch.stack([pitch, -roll], -1), q=q)
+    lean = torch.stack([pitch, -roll], -1)
+    return _silent(x, "G"), replace(guess, position=position, yaw=yaw, lean=lean, q=problem.kin.mirrored(q))
 
 
 def limb_links(skeleton: Skeleton, limb: Limb) -> list[int]:

@@ -52,6 +52,12 @@ def rot(axis: int, angle: Tensor) -> Tensor:
     return torch.stack(rows, -1).reshape(*angle.shape, 3, 3)
 
 
+def yaw_pitch_roll(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """(...,) rad each of R (..., 3, 3) = rot(2, yaw) rot(1, pitch) rot(0, roll)."""
+    yaw, roll = torch.atan2(R[..., 1, 0], R[..., 0, 0]), torch.atan2(R[..., 2, 1], R[..., 2, 2])
+    return yaw, -torch.asin(R[..., 2, 0].clamp(-1, 1)), roll
+
+
 def joint_rotation(q: Tensor) -> Tensor:
     """(..., 3, 3) of joint angles (..., 3) about x (abduction), y (flexion), z (twist): Ry Rx Rz, written out."""
     (cx, cy, cz), (sx, sy, sz) = torch.cos(q).unbind(-1), torch.sin(q).unbind(-1)
@@ -121,6 +127,10 @@ class Kinematics:
         ends = torch.where(self.c_own[None, :, :, None], torch.zeros(1), offset[:, self.c_nodes])
         flesh = self.c_shift + FLESH_SPREAD * shape["flesh"][:, self.flesh_variable] * self.flesh_side
         return ends + flesh * shape["log_length"].exp()[:, None, None, None]
+
+    def mirrored(self, q: Tensor) -> Tensor:
+        """(..., B, 3) rad, joint angles of the mirror image of the body with angles q."""
+        return q[..., self.mirror[: self.B], :] * torch.tensor([-1.0, 1.0, -1.0])
 
     def pose(self, shape: dict[str, Tensor], position: Tensor, R_root: Tensor, q: Tensor) -> Posed:
         """Forward kinematics. position (H, T, 3), R_root (H, T, 3, 3), q (H, T, B, 3) rad with an unused root row."""

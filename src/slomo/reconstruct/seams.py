@@ -53,8 +53,7 @@ class Piece:
     def exchanged(self, links: Tensor, first: int, last: int) -> Guess:
         """The guess with the angles of left and right `links` exchanged in the frames from `first` to before `last`."""
         q = self.guess.q.clone()
-        other = self.problem.kin.mirror[links]
-        q[:, first:last, links] = self.guess.q[:, first:last, other] * torch.tensor([-1.0, 1.0, -1.0])
+        q[:, first:last, links] = self.problem.kin.mirrored(self.guess.q)[:, first:last, links]
         return replace(self.guess, q=q)
 
     def moments(self, links: Tensor) -> list[int]:
