@@ -77,8 +77,8 @@ def iou(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return (a & b).sum((1, 2)) / np.maximum((a | b).sum((1, 2)), 1)
 
 
-def segment(frames: np.ndarray, choice: Choice | None = None):
-    network = SeesWhatIsNoGround()
+def segment(frames: np.ndarray, choice: Choice | None = None, network: SeesWhatIsNoGround | None = None):
+    network = network or SeesWhatIsNoGround()
     segmenter = SaliencySegmenter(network, choice or Choice(), every=2)  # pyright: ignore[reportArgumentType]
     return segmenter.segment(frames, dense_flow(frames), lambda f: None)
 
@@ -122,6 +122,32 @@ def test_what_an_animal_walks_up_to_is_not_the_animals():
     frames, (_, animal) = scene(40, things)
     found = segment(frames)
     assert iou(found.masks, animal).min() > 0.8
+
+
+class ForgetsWhatIsNear(SeesWhatIsNoGround):
+    """What is at most 40 px to the left of a red body, and does not touch it, does not stand out."""
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        seen = super().__call__(image)
+        red = (seen > 0.5) & (image[..., 0] > image[..., 1] + 60)
+        if not red.any():
+            return seen
+        for piece in components(seen > 0.5, 30):
+            if not (piece & red).any():
+                away = np.nonzero(red.any(0))[0].min() - np.nonzero(piece.any(0))[0].max()
+                seen[piece] *= away > 40
+        return seen
+
+
+def test_furniture_that_did_not_stand_out_for_a_while_is_still_there_when_it_is_touched():
+    def feeder(x, y):
+        return (abs(x) < 14) & (y > 28) & (y < 95)
+
+    things = [(feeder, lambda t: 30.0, GREY), (body, lambda t: 122 - 0.38 * min(t, 130), RED)]
+    frames, (_, animal) = scene(210, things)
+    found = segment(frames, Choice(0, point=(122.0, 62.0)), ForgetsWhatIsNear())
+    assert iou(found.masks, animal).min() > 0.8
+    assert found.report["colour_repaired_frames"] == 0  # by colour legs may go with it
 
 
 def test_a_box_picks_and_an_empty_place_says_so():

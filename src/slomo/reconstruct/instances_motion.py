@@ -18,7 +18,7 @@ _LOST = 64.0  # px, a motion that flow cannot have followed
 _ASTRAY = 1.5  # px, median motion of the whole picture, from which on the homography has not been found
 _BENDS = 1.5  # px of motion that no flat thing has, from which on a body is said to be alive
 _CALM = 0.3, 0.45  # px as a whole and of bending, likewise before a camera that stands still, where things have 0.06
-_ALIKE = 10.0  # levels of RGB, between two frames of a thing that is still the same
+ALIKE = 10.0  # levels of RGB, between two frames of a thing that is still the same
 _KEPT = 64  # frames whose motion is remembered
 _STILL = 0.3  # px of the median motion, below which the camera stands still and nothing has parallax
 
@@ -86,6 +86,11 @@ class SharedMotion:
         whole = lambda m: cv2.resize(m.astype(np.uint8), self._flow.size, interpolation=cv2.INTER_NEAREST) > 0  # noqa: E731
         return [whole(piece) for piece in pieces[:3]]
 
+    def calm(self, t: int) -> np.ndarray:
+        """(H, W) bool, what is not known to move in frame t."""
+        moves = np.nan_to_num(np.linalg.norm(self.residual(t), axis=-1)) > 0.5 * MOVES
+        return cv2.resize(moves.astype(np.uint8), self._flow.size, interpolation=cv2.INTER_NEAREST) == 0
+
     def lasting(self, t: int, patch: np.ndarray, bodies: Mapping[int, np.ndarray]) -> np.ndarray:
         """(H, W) bool, what of a patch (H, W) in frame t lies in the body (H, W) bool of every frame of `bodies`, where
         the flow carries it there."""
@@ -108,7 +113,7 @@ class SharedMotion:
         for k in bodies:
             if k != t and others[k].any():
                 there = self._chain(t, k)
-                alike = np.abs(sample(small(frames[k]), there) - here).mean(-1) < _ALIKE
+                alike = np.abs(sample(small(frames[k]), there) - here).mean(-1) < ALIKE
                 again |= [alike & (sample(small(m[k]), there) > 0.5) for m in (others, bodies)]
         wide = [_wider_than_a_leg(body & seen, body).astype(np.uint8) for seen in again]
         other, own = (bodies[t] & (cv2.resize(w, self._flow.size) > 0) for w in wide)

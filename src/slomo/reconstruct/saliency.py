@@ -6,7 +6,7 @@ import numpy as np
 
 from slomo.reconstruct.flow import Flow, sample
 from slomo.reconstruct.instances import Choice, Look, components, distance, tell_apart
-from slomo.reconstruct.instances_motion import MOVES, SharedMotion, foreign
+from slomo.reconstruct.instances_motion import ALIKE, MOVES, SharedMotion, foreign
 from slomo.reconstruct.segment import Masks, Report, box_of, component_at, frame_certainty, grown, no_subject
 from slomo.reconstruct.surroundings import give_back_patches, give_back_surroundings
 from slomo.reconstruct.u2net import U2Net
@@ -172,14 +172,22 @@ class _Track:
     def follow(self, order: list[int], tick) -> None:
         """Fill `layers` along the frames `order`, the first of which is the seed."""
         subject, others = self._at_seed
+        resting = np.zeros_like(others)
         x0, y0, x1, y1 = box_of(subject)
         self._sizes = [(x1 - x0, y1 - y0, float(subject.sum()))]
         self._velocity = self.motion.velocity(order[0], subject)
         for previous, t in zip([order[0], *order], order, strict=False):
             if t != previous:
                 offset = self.flow.chain(t, previous)
-                subject, others = (sample(m.astype(np.float32), offset) > 0.5 for m in (subject, others))
-            subject, others = self._look_at(t, subject, others)
+                subject, others, resting = (
+                    sample(m.astype(np.float32), offset) > 0.5 for m in (subject, others, resting)
+                )
+                before = sample(self.frames[previous].astype(np.float32), offset)
+                resting &= np.abs(before - self.frames[t]).mean(-1) < ALIKE
+            known = others | resting
+            subject, others = self._look_at(t, subject, known)
+            # Furniture that does not stand out for a while is still there when the subject touches it.
+            resting = known & ~others & ~grown(subject, 0.03) & self.motion.calm(t)
             tick()
 
     def _look_at(self, t: int, carried: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
