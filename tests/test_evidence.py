@@ -44,7 +44,9 @@ def _guess(*, phase: float) -> Guess:
     """A walk on the spot, heading 40 degrees towards the camera."""
     t = np.arange(T) / FPS
     walk = next(g for g in SKELETON.gaits if g.name == "walk")
-    q, _ = hypotheses.gait_pose(KIN, walk, GaitHypothesis("walk", 1.2, phase), t, speed=np.full(T, 1.1), leg=0.75)
+    q, _ = hypotheses.gait_pose(
+        KIN, walk, GaitHypothesis("walk", 1.2, phase), t, clock=t, speed=np.full(T, 1.1), leg=0.75
+    )
     position = np.tile([0.0, 0.0, 0.93 * LENGTH], (T, 1))
     return Guess(
         _f(position)[None], torch.full((1, T), -0.7), torch.zeros(1, T, 2), _f(q)[None], torch.full((1, T, 4), -1.0)

@@ -52,7 +52,7 @@ def _walk() -> tuple[np.ndarray, dict, dict]:
     walk = next(g for g in kin.skeleton.gaits if g.name == "walk")
     speed = 1.1
     gait = GaitHypothesis("walk", 1.2, 0.3)
-    q, _ = hypotheses.gait_pose(kin, walk, gait, t, speed=np.full(T, speed), leg=0.75)
+    q, _ = hypotheses.gait_pose(kin, walk, gait, t, clock=t, speed=np.full(T, speed), leg=0.75)
     f = lambda x: torch.as_tensor(x, dtype=torch.float32)  # noqa: E731
     position = np.stack([-0.75 + speed * LENGTH * t, np.full(T, 2.3), np.full(T, 0.93 * LENGTH)], 1)
     shape = kin.shape_variables(1)

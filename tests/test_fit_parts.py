@@ -150,7 +150,7 @@ def test_feet_of_a_hypothetical_walk_go_back_in_stance_and_forward_in_swing():
     walk = next(g for g in kin.skeleton.gaits if g.name == "walk")
     t = np.linspace(0, 2, 200)
     g = GaitHypothesis("walk", 1.0, 0.0)
-    q, contact = hypotheses.gait_pose(kin, walk, g, t, speed=np.full(200, 0.8), leg=0.75)
+    q, contact = hypotheses.gait_pose(kin, walk, g, t, clock=t, speed=np.full(200, 0.8), leg=0.75)
     assert contact.mean(0) == pytest.approx([walk.duty] * 4, abs=0.02)
     body = _posed(kin, torch.as_tensor(q, dtype=torch.float32)[None], torch.eye(3))
     for n, limb in enumerate(kin.skeleton.limbs):

@@ -26,7 +26,7 @@ def motion() -> Guess:
     root = RootGuess(np.stack([0.8 * t, 0 * t], 1), 1.0, 0 * t, 4.0, np.full(T, 0.8))
     walk = next(g for g in KIN.skeleton.gaits if g.name == "walk")
     guess = hypotheses.placed(KIN, root, np.zeros((1, T)))
-    q, _ = hypotheses.gait_pose(KIN, walk, GaitHypothesis("walk", 0.9, 0.1), t, speed=root.speed, leg=0.75)
+    q, _ = hypotheses.gait_pose(KIN, walk, GaitHypothesis("walk", 0.9, 0.1), t, clock=t, speed=root.speed, leg=0.75)
     guess.q[0] = torch.as_tensor(q, dtype=torch.float32)
     return guess
 

@@ -8,25 +8,30 @@ import torch
 
 from slomo.pinhole import Intrinsics
 from slomo.reconstruct.fit import _diverse
-from slomo.reconstruct.hypotheses import GRAVITY, GaitHypothesis, gait_grid, stride_frequencies
+from slomo.reconstruct.hypotheses import GRAVITY, GaitHypothesis, gait_grid, gait_pose
+from slomo.reconstruct.kinematics import Kinematics
+from slomo.reconstruct.stride import Steps, steps_of
 from slomo.skeleton import load_skeleton
 
 FPS, WIDTH, HEIGHT = 30.0, 96, 64
 
 
-def seen(frequency: float, T: int = 90, *, seed: int = 0):
-    """A body with a near pair of legs and a thinner far pair in the other phase: masks (T, 64 * 96), as observed."""
+def seen(frequency: float, T: int = 90, *, seed: int = 0, clock: np.ndarray | None = None):
+    """A body with a near pair of legs and a thinner far pair in the other phase: masks (T, 64 * 96), as observed. Its
+    strides keep a `clock` (T,) s, or time."""
     rng = np.random.default_rng(seed)
+    clock = np.arange(T) / FPS if clock is None else clock
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     masks = np.zeros((T, HEIGHT, WIDTH), bool)
     for t in range(T):
         masks[t] = (np.abs(y - 20) < 10) & (np.abs(x - 48) < 34)
         for hip, phase, half in ((22, 0.0, 4), (22, 0.5, 2), (72, 0.5, 4), (72, 0.0, 2)):
-            swing = 0.35 * np.sin(2 * np.pi * (frequency * t / FPS + phase)) + 0.02 * rng.normal()
+            swing = 0.35 * np.sin(2 * np.pi * (frequency * clock[t] + phase)) + 0.02 * rng.normal()
             masks[t] |= (np.abs(x - hip - swing * (y - 28)) < half) & (y >= 28) & (y < 58)
     box = np.array([[np.flatnonzero(m.any(0)).min(), 10, np.flatnonzero(m.any(0)).max(), 57] for m in masks])
     return SimpleNamespace(
-        dt=torch.full((T - 1,), 1 / FPS),
+        t=torch.arange(T) / FPS,
+        at=torch.arange(T),
         K=Intrinsics(100.0, 100.0, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT),
         mask=torch.as_tensor(masks.reshape(T, -1)),
         box=box,
@@ -34,18 +39,61 @@ def seen(frequency: float, T: int = 90, *, seed: int = 0):
     )
 
 
+def steps(obs: SimpleNamespace, speed: np.ndarray | None = None) -> Steps:
+    return steps_of(obs, np.ones(len(obs.at)) if speed is None else speed)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("frequency", [1.2, 2.0, 2.5])
 def test_a_fast_stride_is_not_taken_for_several(frequency, seed):
     """What two or three strides later looks most alike by chance is not the period."""
-    found = stride_frequencies(seen(frequency, seed=seed), 0.45, 5.0)[:2]  # type: ignore[arg-type]
+    found = steps(seen(frequency, seed=seed)).frequencies(0.45, 5.0)[:2]
     assert min(abs(f / frequency - 1) for f in found) < 0.05
 
 
 def test_frequencies_stay_within_the_range():
-    found = stride_frequencies(seen(1.2), 0.9, 1.5)  # type: ignore[arg-type]
+    found = steps(seen(1.2)).frequencies(0.9, 1.5)
     assert found
     assert all(0.9 <= f <= 1.5 for f in found)
+
+
+@pytest.mark.parametrize("power", [0.5, 1.0])
+@pytest.mark.parametrize("change", ["faster", "stops"])
+def test_strides_of_a_body_that_speeds_up_or_stops_keep_a_clock_of_its_speed(change, power):
+    T = 120
+    t = np.arange(T) / FPS
+    speed = 0.4 + 1.2 * t / t[-1] if change == "faster" else np.clip(3.2 - t, 0.05, 1)
+    pace = (speed / speed.mean()) ** power
+    clock = np.concatenate([[0], np.cumsum(0.5 * (pace[1:] + pace[:-1]) / FPS)])
+    clock *= t[-1] / clock[-1]
+    noise = np.random.default_rng(0).normal(1, 0.1, T)
+    found = steps(seen(1.5, T, clock=clock), speed * noise)
+    assert found.power > 0
+    assert np.abs(found.clock - clock).max() < 0.25 / 1.5
+    assert min(abs(f / 1.5 - 1) for f in found.frequencies(0.45, 5.0)[:2]) < 0.06
+
+
+def test_strides_of_an_even_walk_keep_time():
+    """Neither the noise of a path nor a speed that strides know nothing of makes them a clock of their own."""
+    obs = seen(1.5)
+    for speed in (np.random.default_rng(0).normal(1, 0.2, 90), np.linspace(0.5, 1.5, 90)):
+        found = steps(obs, speed)
+        assert found.power == 0
+        np.testing.assert_allclose(found.clock, np.arange(90) / FPS, atol=1e-9)
+
+
+def test_who_stops_has_all_feet_on_the_ground():
+    skeleton = load_skeleton("quadruped")
+    walk = next(g for g in skeleton.gaits if g.name == "walk")
+    t = np.arange(120) / FPS
+    speed = np.where(t < 2, 1.0, 0.01)
+    clock = np.concatenate([[0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) / FPS)])
+    gait = GaitHypothesis("walk", 1.2, 0.3)
+    q, contact = gait_pose(Kinematics(skeleton), walk, gait, t, clock=clock, speed=speed, leg=0.75)
+    assert contact[t < 1.9].mean() == pytest.approx(walk.duty, abs=0.1)
+    assert contact[t > 2.1].all()
+    folds = [joint for limb in skeleton.limbs for joint, _ in limb.lift]
+    assert np.abs(q[t > 2.1][:, folds, 1]).max() < 0.1 * np.abs(q[:, folds, 1]).max()
 
 
 def test_a_gait_is_tried_of_every_size_that_the_animal_may_have():
@@ -55,7 +103,7 @@ def test_a_gait_is_tried_of_every_size_that_the_animal_may_have():
     speed = (0.6 * trot.froude[0] * GRAVITY * leg / 1.6) ** 0.5  # of 1.6 m, as doubtful as speeds are
 
     def tried(metres: float | None) -> set[str]:
-        grid = gait_grid(seen(1.2), skeleton, leg=leg, speed=speed, metres=metres, phases=4)  # type: ignore[arg-type]
+        grid = gait_grid(steps(seen(1.2)), skeleton, leg=leg, speed=speed, metres=metres, phases=4)
         return {g.name for g in grid}
 
     assert "trot" in tried(1.6)

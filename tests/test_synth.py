@@ -44,6 +44,21 @@ def test_paws_stand_still_and_bones_keep_their_length(animal, gait):
         assert np.allclose(length, np.linalg.norm(rest[a] - rest[b]), rtol=1e-6)
 
 
+def test_a_tempo_plays_the_same_strides_at_another_pace():
+    """What is passed and what stands is as in the steady clip, at other times; who stops stays where it is."""
+    made = {tempo: truth(Config(gait="trot", tempo=tempo, seconds=3.0)) for tempo in ("steady", "slower", "stops")}
+    length = float(made["steady"]["body_length"])
+    root = {tempo: arrays["keypoints"][:, KEYPOINTS.index("withers"), :2] for tempo, arrays in made.items()}
+    speed = {tempo: np.linalg.norm(np.diff(x, axis=0), axis=1) * 30 for tempo, x in root.items()}
+    assert np.mean(speed["slower"][:10]) / np.mean(speed["slower"][-10:]) == pytest.approx(4.0, rel=0.25)
+    assert speed["stops"][-25:].max() < 1e-9
+    foot = KEYPOINTS.index("hind_left_paw")
+    places = {tempo: arrays["keypoints"][arrays["foot_contact"][:, 2], foot] for tempo, arrays in made.items()}
+    for tempo in ("slower", "stops"):
+        away = np.linalg.norm(places[tempo][:, None] - places["steady"], axis=-1).min(1)
+        assert away[: len(away) // 2].max() < 0.02 * length
+
+
 @pytest.mark.parametrize("move", figure.MOVES)
 def test_people_stand_still_and_over_their_soles(move):
     skeleton = load_skeleton("human")

@@ -110,6 +110,12 @@ def add_commands(app: typer.Typer) -> None:
         ] = None,
         speed: Annotated[float | None, typer.Option(help="m/s; 0: the usual speed of the gait.")] = None,
         turn: Annotated[float | None, typer.Option(help="Degrees a second, positive to the left.")] = None,
+        tempo: Annotated[
+            str | None,
+            typer.Option(
+                metavar="steady|faster|slower|stops|starts", help="How fast the motion is played. Default: steady."
+            ),
+        ] = None,
         camera: Annotated[str | None, typer.Option(metavar="follow|orbit|pan|static", help="Default: follow.")] = None,
         view: Annotated[float | None, typer.Option(help="Degrees; 0: the left flank, 90: from the front.")] = None,
         shake: Annotated[float | None, typer.Option(help="Camera shake; 1: a hand.")] = None,
@@ -134,8 +140,8 @@ def add_commands(app: typer.Typer) -> None:
         from slomo.synth.clip import Config, write_clip
 
         given: dict[str, Any] = dict(
-            animal=animal, gait=gait, speed=speed, turn=turn, camera=camera, view=view, shake=shake, clutter=clutter,
-            seconds=seconds, fps=fps, width=width, height=height, noise=noise, crf=crf, seed=seed,
+            animal=animal, gait=gait, speed=speed, turn=turn, tempo=tempo, camera=camera, view=view, shake=shake,
+            clutter=clutter, seconds=seconds, fps=fps, width=width, height=height, noise=noise, crf=crf, seed=seed,
         )  # fmt: skip
         config = settings.make(Config, {k: v for k, v in given.items() if v is not None}, where="synth")
         session.console.start("synth")

@@ -15,6 +15,7 @@ from slomo.reconstruct import hypotheses, limb_track, pose_track, starts
 from slomo.reconstruct.hypotheses import GaitHypothesis, RootGuess
 from slomo.reconstruct.problem import Problem, Schedule, optimise, pick, rank
 from slomo.reconstruct.run import Run, checkpoint, join, restore
+from slomo.reconstruct.stride import steps_of
 from slomo.reconstruct.trajectory import Guess
 from slomo.stage import Progress
 
@@ -120,8 +121,11 @@ def _to_gait(
     rest = skeleton.rest()
     leg = float(np.mean([rest[limb.swing, 2] - rest[limb.contact, 2] for limb in skeleton.limbs]))
     speed = float(np.median(root.speed))
-    grid = hypotheses.gait_grid(obs, skeleton, leg=leg, speed=speed, metres=metres, phases=effort.phases_of_gait)
+    # The speed of one who stays in place is noise.
+    steps = steps_of(obs, root.speed if root.travelled > 1 else np.ones_like(root.speed))
+    grid = hypotheses.gait_grid(steps, skeleton, leg=leg, speed=speed, metres=metres, phases=effort.phases_of_gait)
     run.log["stride_candidates_hz"] = sorted({round(g.frequency, 3) for g in grid})
+    run.log["stride_clock_power"] = steps.power
     t = obs.t.numpy()
     entries: list[tuple[float, int, GaitHypothesis, Guess]] = []
     gaits = {g.name: g for g in skeleton.gaits}
@@ -144,7 +148,10 @@ def _to_gait(
         posed.append(base)
         for i in range(0, len(grid), 24):
             chunk = grid[i : i + 24]
-            poses = [hypotheses.gait_pose(kin, gaits[g.name], g, t, speed=root.speed, leg=leg) for g in chunk]
+            poses = [
+                hypotheses.gait_pose(kin, gaits[g.name], g, t, clock=steps.clock, speed=root.speed, leg=leg)
+                for g in chunk
+            ]
             guess = _lay(base, poses)
             value = rank(problem, pick(run.x, one.expand(len(chunk))), guess, draws=1, frames=16, pixels=128)
             entries += [

@@ -13,20 +13,20 @@ from slomo.reconstruct.evidence import Evidence
 from slomo.reconstruct.kinematics import Kinematics, yaw_pitch_roll
 from slomo.reconstruct.observations import Observations
 from slomo.reconstruct.problem import Problem, Variables
+from slomo.reconstruct.stride import Steps
 from slomo.reconstruct.trajectory import Guess
 from slomo.skeleton import Gait, Limb, Skeleton
 
 Array = np.ndarray
 Tensor = torch.Tensor
 GRAVITY = 9.81
-_AS_DEEP = 0.45  # share of the depth of a dip in self-similarity, for a shorter lag to be the period of a longer one
-_MULTIPLE = 0.06  # how far the longer one may be from a multiple of it
+_STANDS = 0.15  # of the clip's mean pace: strides that are slower than that have come to a stop
 _STRETCHES = (0.9, 0.95, 1.0, 1.05, 1.1), (0.95, 1.0, 1.05)  # of the likeliest stride frequency and the next
 
 
 @dataclass(frozen=True)
 class GaitHypothesis:
-    """A gait with stride frequency Hz and phase in [0, 1) of the stride at t = 0."""
+    """A gait with stride frequency, Hz of the clock that strides keep, and phase in [0, 1) of the stride at t = 0."""
 
     name: str
     frequency: float
@@ -162,52 +162,8 @@ def leg_links(skeleton: Skeleton) -> list[int]:
     return sorted({link for limb in skeleton.limbs for link in limb_links(skeleton, limb)})
 
 
-def stride_frequencies(obs: Observations, low: float, high: float) -> list[float]:
-    """Candidate stride frequencies Hz from the self-similarity of the leg band, most likely first.
-
-    Masks are cut to their box's lower half; the mean difference between frames a lag apart dips at the stride period,
-    about as deep at half of it where left and right look alike, and at its multiples: of each of the two deepest dips
-    the shortest lag that it is a multiple of is read in both ways, then the dips themselves.
-    """
-    import cv2
-
-    dt = float(obs.dt.median())
-    K = obs.K
-    bands = []
-    for m, (u0, v0, u1, v1), empty in zip(obs.mask.numpy(), obs.box, obs.empty, strict=True):
-        full = m.reshape(K.height, K.width)
-        crop = full[int((v0 + v1) / 2) : int(v1) + 1, int(u0) : int(u1) + 1]
-        bands.append(np.zeros((16, 48)) if empty or not crop.size else
-                     cv2.resize(crop.astype(np.float32), (48, 16), interpolation=cv2.INTER_AREA))  # fmt: skip
-    x = np.stack(bands)
-    F = len(x)
-    lags = np.arange(1, max(2, int(0.75 * F)))
-    d = np.array([np.abs(x[k:] - x[:-k]).mean() for k in lags])
-    trend = np.convolve(np.pad(d, 8, "edge"), np.ones(17) / 17, "valid")
-    dips = [i for i in range(1, len(d) - 1) if d[i] <= d[i - 1] and d[i] < d[i + 1]]
-    depth = trend - d
-    dips.sort(key=lambda i: -depth[i])
-
-    def lag(i: int) -> float:
-        c = d[i - 1] - 2 * d[i] + d[i + 1]
-        return lags[i] + (0.5 * (d[i - 1] - d[i + 1]) / c if c > 0 else 0.0)
-
-    def whole(i: int) -> int:
-        """The shortest lag that dip i is a multiple of: after two strides or three all looks as alike as after one."""
-        parts = [j for j in dips if lags[j] < lags[i] and depth[j] > _AS_DEEP * depth[i]]
-        parts = [j for j in parts if abs(lag(i) / lag(j) / round(lag(i) / lag(j)) - 1) < _MULTIPLE]
-        return min(parts, key=lambda j: lags[j], default=i)
-
-    out: list[float] = []
-    for i in [*map(whole, dips[:2]), *dips[:2]]:
-        for f in (1 / (lag(i) * dt), 0.5 / (lag(i) * dt)):
-            if low <= f <= high and all(abs(f / g - 1) > 0.06 for g in out):
-                out.append(float(f))
-    return out
-
-
 def gait_grid(
-    obs: Observations, skeleton: Skeleton, *, leg: float, speed: float, metres: float | None, phases: int
+    steps: Steps, skeleton: Skeleton, *, leg: float, speed: float, metres: float | None, phases: int
 ) -> list[GaitHypothesis]:
     """All gaits that fit the speed, with the clip's stride frequencies and `phases` phases each.
 
@@ -217,7 +173,7 @@ def gait_grid(
     """
     natural = math.sqrt(GRAVITY / (leg * (metres or skeleton.typical_length))) / (2 * math.pi)
     slowest, fastest = (m * speed**2 / (GRAVITY * leg) for m in ((metres, metres) if metres else skeleton.lengths))
-    frequencies = stride_frequencies(obs, 0.5 * natural, 5.5 * natural)
+    frequencies = steps.frequencies(0.5 * natural, 5.5 * natural)
     out = []
     for gait in skeleton.gaits:
         # Speed is uncertain (length, path): a factor of two each way in the Froude number.
@@ -230,21 +186,24 @@ def gait_grid(
 
 
 def gait_pose(
-    kin: Kinematics, gait: Gait, hypothesis: GaitHypothesis, t: Array, *, speed: Array, leg: float
+    kin: Kinematics, gait: Gait, hypothesis: GaitHypothesis, t: Array, *, clock: Array, speed: Array, leg: float
 ) -> tuple[Array, Array]:
-    """Joint angles (T, B, 3) and contacts (T, L) of a gait. speed (T,) and leg in body lengths (and s)."""
+    """Joint angles (T, B, 3) and contacts (T, L) of a gait at t (T,) s, whose strides keep a `clock` (T,) s. speed (T,)
+    and leg in body lengths (and s)."""
     q = np.zeros((len(t), kin.B, 3))
     contact = np.zeros((len(t), len(kin.skeleton.limbs)))
-    stroke = speed * gait.duty / hypothesis.frequency
+    pace = np.gradient(clock, t) if len(t) > 1 else np.ones(1)
+    moving = (pace / _STANDS).clip(0, 1)
+    stroke = speed * gait.duty / (hypothesis.frequency * np.maximum(pace, _STANDS))
     amplitude = np.arctan2(stroke / 2, leg).clip(math.radians(4), math.radians(38))
     for n, (limb, land) in enumerate(zip(kin.skeleton.limbs, gait.land, strict=True)):
-        c = (hypothesis.frequency * (t - t[0]) + hypothesis.phase - land) % 1.0
+        c = (hypothesis.frequency * (clock - clock[0]) + hypothesis.phase - land) % 1.0
         swing = ((c - gait.duty) / (1 - gait.duty)).clip(0, 1)
         # Stance: from forward (negative y) to back at constant speed; swing: back to front along a cosine.
         along = np.where(c < gait.duty, 2 * c / gait.duty - 1, np.cos(math.pi * swing))
         q[:, limb.swing, 1] = amplitude * along
-        lift = np.sin(math.pi * swing) * (c >= gait.duty)
+        lift = np.sin(math.pi * swing) * (c >= gait.duty) * moving
         for joint, angle in limb.lift:
             q[:, joint, 1] = angle * lift * np.minimum(1, amplitude / math.radians(15))
-        contact[:, n] = c < gait.duty
+        contact[:, n] = (c < gait.duty) | (moving < 1)
     return q, contact

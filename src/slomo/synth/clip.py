@@ -1,6 +1,7 @@
 """Render a clip of a procedural animal or person, with its truth: `clip.mp4`, `truth.npz` and `masks.npz`."""
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,15 @@ from slomo.stage import Progress
 from slomo.synth.actor import ACTORS, Actor, act, moves
 from slomo.synth.scene import ANIMAL, CAMERAS, camera, light, surroundings
 
+# How fast the motion is played, by the share of the clip that is over.
+TEMPOS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "steady": np.ones_like,
+    "faster": lambda u: 0.4 + 1.2 * u,
+    "slower": lambda u: 1.6 - 1.2 * u,
+    "stops": lambda u: ((0.62 - u) / 0.15).clip(0, 1),
+    "starts": lambda u: ((u - 0.3) / 0.2).clip(0, 1),
+}
+
 
 @dataclass(frozen=True)
 class Config:
@@ -24,6 +34,8 @@ class Config:
         gait: "walk", "pace", "trot" or "stand"; of a person "walk", "run", "stand", "squat", "jack" or "wave".
         speed: m/s; 0 = the usual speed of the gait.
         turn: degrees/s, positive to the left.
+        tempo: "steady", or played "faster" or "slower" (fourfold from one end to the other), or it "stops" after half
+            of the clip or "starts" after a third: strides keep their length, and no gait has one frequency.
         camera: "follow", "orbit", "pan" or "static".  view: degrees, 0 = the left flank, 90 = from the front.
         shake: camera shake, 1 = a hand.  clutter: posts near the animal.
         seconds, fps, width, height: of the clip (px).
@@ -35,6 +47,7 @@ class Config:
     gait: str = "walk"
     speed: float = 0.0
     turn: float = 0.0
+    tempo: str = "steady"
     camera: str = "follow"
     view: float = 15.0
     shake: float = 1.0
@@ -48,7 +61,8 @@ class Config:
     seed: int = 0
 
     def __post_init__(self):
-        for name, known in (("animal", ACTORS), ("gait", moves(self.animal)), ("camera", CAMERAS)):
+        choices = (("animal", ACTORS), ("gait", moves(self.animal)), ("tempo", tuple(TEMPOS)), ("camera", CAMERAS))
+        for name, known in choices:
             if getattr(self, name) not in known:
                 raise UsageError(f"no {name} {getattr(self, name)!r}", where="synth", valid=known)
         ranges = dict(seconds=(0.2, 120), fps=(5, 240), width=(64, 3840), height=(64, 2160), speed=(0, 20))
@@ -66,9 +80,11 @@ EMBEDDED = Config(width=640, height=360, crf=26)
 def _staged(config: Config) -> tuple[Actor, np.ndarray, np.ndarray]:
     """The actor, K (3, 3) px and T_world_cam (T, 4, 4)."""
     t = np.arange(round(config.seconds * config.fps)) / config.fps
+    rate = TEMPOS[config.tempo](t / max(t[-1], 1e-9))
+    played = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(t))])
     turn, view, size = np.radians(config.turn), np.radians(config.view), (config.width, config.height)
     try:
-        actor = act(config.animal, config.gait, t, speed=config.speed or None, turn=turn, seed=config.seed)
+        actor = act(config.animal, config.gait, played, speed=config.speed or None, turn=turn, seed=config.seed)
     except ValueError as e:
         raise UsageError(str(e), where="synth", todo="give a lower --speed or another --gait") from None
     K, T_world_cam = camera(
