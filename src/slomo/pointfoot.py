@@ -14,7 +14,8 @@ from typing import Self
 import numpy as np
 
 from slomo.errors import InvalidData
-from slomo.robot import Robot, key_point_names
+from slomo.robot import Robot
+from slomo.robot_file import key_point_names
 from slomo.robot_workspace import directions
 
 Array = np.ndarray
@@ -109,7 +110,7 @@ class PointFootModel:
 
     @property
     def key_points(self) -> tuple[str, ...]:
-        """Names of the points in key-point motions (see `robot.key_point_names`)."""
+        """Names of the points in key-point motions (see `robot_file.key_point_names`)."""
         return key_point_names(self.names)
 
     @property

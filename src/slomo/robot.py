@@ -14,7 +14,7 @@ import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
 from slomo.errors import InvalidData
 from slomo.robot_body import point_foot_body, rigid_groups, swing_masses
-from slomo.robot_file import HUMANOID_LIMBS, find_robot_file, find_urdf, read_robot_file, robot_folders
+from slomo.robot_file import find_robot_file, find_urdf, key_point_names, read_robot_file, robot_folders
 from slomo.robot_limbs import Point, force_limits, frame_point, leg_root, reaches, underside
 from slomo.robot_model import (
     Limb,
@@ -96,7 +96,7 @@ class Robot:
 
     @property
     def key_points(self) -> tuple[str, ...]:
-        """Names of the limbs' ends in key-point motions (see `key_point_names`)."""
+        """Names of the limbs' ends in key-point motions (see `robot_file.key_point_names`)."""
         return key_point_names(self.limb_names)
 
     @property
@@ -243,11 +243,6 @@ class Robot:
         return reaches(self.model, self.q_nominal, starts, feet, pairs=self.pairs, lower=self.lower, upper=self.upper)
 
 
-def key_point_names(limbs: tuple[str, ...]) -> tuple[str, ...]:
-    """`<limb>_foot` of a quadruped's limbs; a humanoid's (left_toe, ...) are named after the point itself."""
-    return limbs if limbs == HUMANOID_LIMBS else tuple(f"{limb}_foot" for limb in limbs)
-
-
 def list_robots() -> list[str]:
     """Names that `load_robot` knows."""
     return sorted(robot_folders())
@@ -271,11 +266,7 @@ def load_robot(name_or_path: str) -> Robot:
     knee_speed = np.minimum(joint_values("knee_speed", file.knee_speed, KNEE * velocity, model, path), velocity)
     note = repair_base_inertia(model)
     limbs = tuple(make_limb(section, model, urdf, path) for section in file.limbs)
-    q_nominal = nominal_pose(file, model, limbs, path)
-    for name, angle, lo, hi in zip(model.names[2:], q_nominal[7:], lower, upper, strict=True):
-        if not lo <= angle <= hi:
-            raise InvalidData(f"nominal: {name} is outside its limits", where=path)
-
+    q_nominal = nominal_pose(file, model, limbs, path, lower=lower, upper=upper)
     swing = swing_masses(model, q_nominal, limbs)
     given = [section.foot_mass or file.point_foot.foot_mass for section in file.limbs]
     foot_mass = np.array([m if m is not None else s for m, s in zip(given, swing, strict=True)])

@@ -134,6 +134,11 @@ def find_urdf(section: UrdfSection, robot_file: Path) -> tuple[Path, tuple[Path,
     raise InvalidData(f"{section.path!r} is not in the package {section.package!r}", where=robot_file)
 
 
+def key_point_names(limbs: tuple[str, ...]) -> tuple[str, ...]:
+    """`<limb>_foot` of a quadruped's limbs; a humanoid's (left_toe, ...) are named after the point itself."""
+    return limbs if limbs == HUMANOID_LIMBS else tuple(f"{limb}_foot" for limb in limbs)
+
+
 def find_mesh(address: str, urdf: Path, package_dirs: tuple[Path, ...]) -> Path:
     """File behind a mesh address of the URDF. Raises `InvalidData` when there is none."""
     relative = address.removeprefix("package://").lstrip("/")

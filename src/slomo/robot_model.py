@@ -133,14 +133,19 @@ def joint_values(what: str, patterns: Mapping[str, float], default: Array, model
     return out
 
 
-def nominal_pose(file: RobotFile, model: pin.Model, limbs: Iterable[Limb], path: Path) -> Array:
-    """(nq,) the nominal joints, the base link level and as high as puts the lowest foot on the ground."""
+def nominal_pose(
+    file: RobotFile, model: pin.Model, limbs: Iterable[Limb], path: Path, *, lower: Array, upper: Array
+) -> Array:
+    """(nq,) the nominal joints, which must lie within `lower` and `upper` (nj,) rad, the base link level and as high as
+    puts the lowest foot on the ground."""
     q, names = pin.neutral(model), list(model.names[2:])
     angles = match_joints(file.nominal, names, "nominal", path)
     missing = [name for i, name in enumerate(names) if i not in angles]
     if missing:
         raise InvalidData(f"nominal: no angle for joint {missing[0]}", where=path)
     for i, angle in angles.items():
+        if not lower[i] <= angle <= upper[i]:
+            raise InvalidData(f"nominal: {names[i]} is outside its limits", where=path)
         q[7 + i] = angle
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)

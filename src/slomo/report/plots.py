@@ -7,7 +7,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from slomo.motion import KeypointMotion, Reference, Rollout
-from slomo.robot import key_point_names
+from slomo.robot_file import key_point_names
 from slomo.terrain import Terrain
 
 

@@ -90,7 +90,7 @@ def camera(
     distance = (length + along) / (2 * np.tan(HFOV / 2) * 0.60)
     middle = target[len(t) // 2]
     carried = {"follow": 0.75, "orbit": 0.75, "pan": 0.0, "static": 0.0}[mode]
-    smooth = np.array([np.polyval(np.polyfit(t, x, 3), t) for x in target.T]).T
+    smooth = np.array([np.polyval(np.polyfit(t, x, min(3, len(t) - 1)), t) for x in target.T]).T
     centre = middle + carried * (smooth - middle)
     rate = np.radians(10) if mode == "orbit" else np.radians(3) if mode == "follow" else 0.0
     angle = heading + np.pi / 2 - view + rate * (t - t[len(t) // 2])
