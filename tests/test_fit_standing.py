@@ -25,10 +25,25 @@ def _stepping(noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
 def test_a_stepping_foot_stands_when_it_stands():
     feet, down = _stepping(noise=0.003)
     root = np.stack([0.8 * T, 0 * T, 0.8 + 0 * T], 1)
-    p = standing.contact_probability(feet, root, T, 1.0, SOLE)[:, 0]
+    p = standing.contact_probability(feet, root, T, length=1.0, leg=0.735, sole=SOLE)[:, 0]
     assert ((p > 0.5) == down).mean() > 0.9
     assert p[5] > 0.95
     assert p[22] < 0.05
+
+
+def test_heights_and_speeds_are_judged_by_the_length_of_the_legs():
+    """A foot an eighth of a leg above the ground is up, and one that slides is no stance: of a person, whose legs are
+    half as long as the body, as of an animal, whose legs are three quarters of the trunk."""
+    for leg in (0.497, 0.735):
+        up = (T > 0.5) & (T < 1.0)
+        feet = np.zeros((60, 1, 3))
+        feet[:, 0, 2] = SOLE + np.where(up, 0.12 * leg, 0.01)
+        p = standing.contact_probability(feet, np.zeros((60, 3)), T, length=1.0, leg=leg, sole=SOLE)[:, 0]
+        assert ((p < 0.5) == up).all()
+        slides = np.zeros((60, 1, 3))
+        slides[:, 0, 0], slides[:, 0, 2] = 0.6 * leg * T, SOLE
+        p = standing.contact_probability(slides, np.zeros((60, 3)), T, length=1.0, leg=leg, sole=SOLE)[:, 0]
+        assert (p < 0.5).all()
 
 
 def test_a_blink_is_no_step_and_a_long_rise_is():

@@ -118,12 +118,10 @@ def _to_gait(
     keep = [int(order[0])]
     keep += [int(k) for k in order[1:2] if losses[k] < 1.15 * losses[order[0]]]
     skeleton, kin, obs = problem.kin.skeleton, problem.kin, problem.obs
-    rest = skeleton.rest()
-    leg = float(np.mean([rest[limb.swing, 2] - rest[limb.contact, 2] for limb in skeleton.limbs]))
     speed = float(np.median(root.speed))
     # The speed of one who stays in place is noise.
     steps = steps_of(obs, root.speed if root.travelled > 1 else np.ones_like(root.speed))
-    grid = hypotheses.gait_grid(steps, skeleton, leg=leg, speed=speed, metres=metres, phases=effort.phases_of_gait)
+    grid = hypotheses.gait_grid(steps, skeleton, leg=kin.leg, speed=speed, metres=metres, phases=effort.phases_of_gait)
     run.log["stride_candidates_hz"] = sorted({round(g.frequency, 3) for g in grid})
     run.log["stride_clock_power"] = steps.power
     t = obs.t.numpy()
@@ -149,7 +147,7 @@ def _to_gait(
         for i in range(0, len(grid), 24):
             chunk = grid[i : i + 24]
             poses = [
-                hypotheses.gait_pose(kin, gaits[g.name], g, t, clock=steps.clock, speed=root.speed, leg=leg)
+                hypotheses.gait_pose(kin, gaits[g.name], g, t, clock=steps.clock, speed=root.speed, leg=kin.leg)
                 for g in chunk
             ]
             guess = _lay(base, poses)

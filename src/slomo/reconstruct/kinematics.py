@@ -6,6 +6,7 @@ Shape variables are unit normals: each is multiplied by the spread of what it ch
 import itertools
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from slomo.skeleton import Skeleton
@@ -70,7 +71,8 @@ def joint_rotation(q: Tensor) -> Tensor:
 
 
 class Kinematics:
-    """A skeleton's tables as tensors, and its forward kinematics."""
+    """A skeleton's tables as tensors, its mean `leg` length (hip or shoulder over the foot at rest, body lengths), and
+    its forward kinematics."""
 
     def __init__(self, skeleton: Skeleton):
         self.skeleton = skeleton
@@ -104,6 +106,8 @@ class Kinematics:
         ]
         self.place = i(list(itertools.chain(*by_depth))).argsort()
         self.contacts = i(list(skeleton.contacts))
+        high = skeleton.rest()[:, 2]
+        self.leg = float(np.mean([high[limb.swing] - high[limb.contact] for limb in skeleton.limbs]))
 
     def shape_variables(self, H: int) -> dict[str, Tensor]:
         """Zeros of every shape variable: the skeleton as written, one unit long."""

@@ -18,6 +18,9 @@ Tensor = torch.Tensor
 
 SOFT_PX = 0.7  # width of the silhouette's edge and of the smooth minimum over capsules, working pixels
 SWING = 5.0  # accelerations of a gait's nodes in units of speed squared over body length
+LOW = 0.095  # leg lengths above its stance height at which a foot is as likely up as down
+SLOW = 0.476  # leg lengths / s, likewise, of a body at rest
+TRAVEL = 0.2  # what is added to it of the body's own speed, for its path may be wrong
 SLIDE = 0.75  # body lengths / s of a standing foot: the unit of its drift
 # Masks lose tails in some frames and find them in others. A tail that was pushed out of all the background where it is
 # missed would hide behind the body for good; these are what it costs there, against any other part.
@@ -168,11 +171,12 @@ def contact_weight(s: State) -> Tensor:
     """
     with torch.no_grad():
         height, velocity, x = feet(s)
-        low = torch.sigmoid((0.07 - torch.maximum(height[:, 1:], height[:, :-1])) / 0.02)
+        leg = s.kin.leg
+        low = torch.sigmoid((LOW * leg - torch.maximum(height[:, 1:], height[:, :-1])) / (LOW * leg / 3.5))
         L = s.body.length[:, None]
         root = s.body.nodes[:, :, 0]
         travel = (root[:, 1:] - root[:, :-1]).norm(dim=-1) / L / s.obs.dt
-        limit = 0.35 + 0.2 * travel[..., None]
+        limit = SLOW * leg + TRAVEL * travel[..., None]
         slow = torch.sigmoid((limit - velocity[..., :2].norm(dim=-1)) / (0.25 * limit))
         X = silhouette.to_camera(s.R_cam, s.centre, x)
         K = s.obs.K

@@ -80,7 +80,9 @@ def stood(problem: Problem, x: Variables, guess: Guess) -> tuple[Posed, Array, t
         position, R, q = problem.path(x, guess, length, torch.arange(len(problem.obs.t)))
         free = kin.pose(shape, position, R, q).nodes[0].numpy().astype(float)
         t, feet = problem.obs.t.numpy().astype(float), free[:, list(skeleton.contacts)]
-        contact = standing.contact_probability(feet, free[:, 0], t, own_length(problem, shape), skeleton.sole)
+        contact = standing.contact_probability(
+            feet, free[:, 0], t, length=own_length(problem, shape), leg=kin.leg, sole=skeleton.sole
+        )
         ground = skeleton.sole * float(length[0])
         q = standing.stand(kin, shape, position, R, q, standing.places(feet, contact, t, ground))
         return kin.pose(shape, position, R, q), contact, q

@@ -13,8 +13,8 @@ from slomo.reconstruct.kinematics import Kinematics
 Array = np.ndarray
 Tensor = torch.Tensor
 
-HEIGHT = 0.06  # body lengths above its stance height at which a foot is as likely up as down
-SPEED = 0.35  # body lengths / s, likewise, of a body at rest
+HEIGHT = 0.082  # leg lengths above its stance height at which a foot is as likely up as down
+SPEED = 0.476  # leg lengths / s, likewise, of a body at rest
 TRAVEL = 0.2  # what is added to it of the body's own speed: a path that is wrong slides all feet with it
 SURE = 0.99  # of one frame at most
 CHANGES = 3.0  # how often a second a foot is expected to change between up and down
@@ -25,20 +25,20 @@ PRECISE = 0.002
 STEPS = 4
 
 
-def contact_probability(feet: Array, root: Array, t: Array, length: float, sole: float) -> Array:
+def contact_probability(feet: Array, root: Array, t: Array, *, length: float, leg: float, sole: float) -> Array:
     """(T, F) probability in [0, 1] that a foot stands.
 
     Args:
         feet: (T, F, 3), root: (T, 3) world, z up. t: (T,) s. length: body length, in the same unit.
-        sole: height of a foot that stands, body lengths.
+        leg: length of a leg, sole: height of a foot that stands; body lengths.
     """
     if len(t) < 2:
         return np.full(feet.shape[:2], 0.5)
     height = feet[..., 2] / length - sole
     travel = np.linalg.norm(np.gradient(root[:, :2], t, axis=0), axis=-1) / length
     speed = np.linalg.norm(np.gradient(feet[..., :2], t, axis=0), axis=-1) / length
-    limit = (SPEED + TRAVEL * travel)[:, None]
-    down = _logistic((HEIGHT - height) / (HEIGHT / 4)) * _logistic((limit - speed) / (limit / 4))
+    limit, low = (SPEED * leg + TRAVEL * travel)[:, None], HEIGHT * leg
+    down = _logistic((low - height) / (low / 4)) * _logistic((limit - speed) / (limit / 4))
     down = down.clip(1 - SURE, SURE)
     return smoothed(np.log(np.stack([1 - down, down], -1)), (CHANGES * np.diff(t)).clip(1e-3, 0.4))
 
