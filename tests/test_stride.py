@@ -1,12 +1,14 @@
 """Stride frequencies from the self-similarity of silhouettes, and which gaits are tried."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from slomo.pinhole import Intrinsics
+from slomo.reconstruct import fit
 from slomo.reconstruct.fit import _diverse
 from slomo.reconstruct.hypotheses import GRAVITY, GaitHypothesis, gait_grid, gait_pose
 from slomo.reconstruct.kinematics import Kinematics
@@ -112,8 +114,28 @@ def test_a_gait_is_tried_of_every_size_that_the_animal_may_have():
     assert "gallop" not in tried(None)
 
 
+def test_the_best_gaits_are_ranked_once_more_with_more_pixels(monkeypatch):
+    """Few pixels prefer one phase, many another; what is far behind is not looked at again."""
+    seen = []
+
+    def rank(problem, x, guess, *, draws, frames):
+        seen.append(len(guess))
+        return torch.tensor([abs(g.phase - 0.5) for g in guess])
+
+    monkeypatch.setattr(fit, "rank", rank)
+    monkeypatch.setattr(fit, "pick", lambda x, which: x)
+    monkeypatch.setattr(fit, "join", lambda guesses: guesses)
+    gaits = [GaitHypothesis("gallop", 1.7, n / 100) for n in range(60)]
+    entries = [(abs(g.phase - 0.4), 0, g, g) for g in gaits]
+    found = fit._ranked(None, {}, entries)  # type: ignore[arg-type]
+    assert found[0][2].phase == 0.5
+    assert sum(seen) == fit.SHORTLIST
+    assert sorted(e[2].phase for e in found) == [g.phase for g in gaits]
+    assert [e[0] for e in found[fit.SHORTLIST :]] == sorted(e[0] for e in entries)[fit.SHORTLIST :]
+
+
 def test_every_gait_is_tried_though_all_phases_of_another_rank_before_it():
-    entries = [(n / 100, 0, GaitHypothesis("gallop", 2.0, n / 12), None) for n in range(12)]
+    entries: list[Any] = [(n / 100, 0, GaitHypothesis("gallop", 2.0, n / 12), None) for n in range(12)]
     entries += [(1.0 + n / 100, 0, GaitHypothesis("trot", 2.0, n / 12), None) for n in range(12)]
     entries += [(2.0 + n / 100, 0, GaitHypothesis("walk", 2.0, n / 12), None) for n in range(12)]
     chosen = _diverse(entries, 6)
