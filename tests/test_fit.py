@@ -113,6 +113,15 @@ def walk() -> tuple[np.ndarray, dict, dict]:
     return _walk()
 
 
+def test_one_candidate_leaves_all_gaits_out(walk):
+    """And no more: two headings that are close are both fitted, however few hypotheses are asked for."""
+    _, masks, flow = walk
+    out = run_fit(_inputs(masks, flow), replace(TINY, candidates=1), Silent())
+    tried = out.json["report.json"]["search"]["gait"]
+    assert len(tried) == 2
+    assert all(entry["gait"] == "none" for entry in tried)
+
+
 def test_a_walk_is_found(walk):
     true, masks, flow = walk
     out = reconstruct(_inputs(masks, flow), QUICK, Silent())

@@ -163,7 +163,7 @@ def _to_gait(
             done = effort.schedules[0].iterations * _cost(effort.schedules[0])
             progress.update(done / total_cost(effort), f"trying {len(grid)} gaits: {i}")
     entries = _ranked(problem, run.x, entries)
-    chosen = _diverse(entries, effort.candidates - len(keep))
+    chosen = _diverse(entries, max(0, effort.candidates - len(keep)))
     which = torch.tensor(keep + [k for _, k, _, _ in chosen])
     guesses = posed + [g for *_, g in chosen]
     labels = [run.labels[k] | {"gait": "none"} for k in keep]

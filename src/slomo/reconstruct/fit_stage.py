@@ -21,7 +21,7 @@ from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import Skeleton, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 27
+FIT_VERSION = 28
 
 AGAIN = 0.5  # share of the rates with which the winner is fitted once more, beside one with other limbs
 POLISH = 0.4  # share of the rates with which the chunks of a long clip are polished together
@@ -42,7 +42,8 @@ class FitConfig:
         width: neurons of the hidden layers of Q and G. joint_hz, root_hz: highest frequency of their time features.
         quality: draft, normal or high: how long it works on it.
         iterations: of the heading, gait, rivals, final and limbs phase; none: as the quality says.
-        candidates: hypotheses that are fitted in the gait phase; gait_phases: phases tried of each gait.
+        candidates: hypotheses that are fitted in the gait phase, at least one without a gait for each heading that is
+            left (one or two); gait_phases: phases tried of each gait.
         tilt_moving_deg, tilt_static_deg: s.d. of the given gravity for a camera that moved, and for one that did not.
         weight_*: of the evidence; 0 switches a term off. `facing` is for people only; `view`, `keypoints`, `parts` and
             `surface` are what networks and the user say, where they say anything.
