@@ -15,11 +15,13 @@ from slomo.motion import KeypointMotion
 from slomo.skeleton import load_skeleton
 from slomo.stage import Silent
 from slomo.synth import figure
+from slomo.synth.actor import moves
+from slomo.synth.acts import ACTS, FOLD
 from slomo.synth.animal import ANIMALS, BONES, FEET, KEYPOINTS, proportions, rest_joints
 from slomo.synth.clip import EMBEDDED as EMBEDDED_CONFIG
 from slomo.synth.clip import Config, truth, write_clip
 from slomo.synth.creature import create
-from slomo.synth.gait import GAITS, animate
+from slomo.synth.gait import animate
 from slomo.synth.score import score
 
 SHARED = Path(__file__).parents[2] / "shared"
@@ -27,11 +29,10 @@ EMBEDDED = Path(str(files("slomo"))) / "assets" / "walk"
 T = np.arange(90) / 30
 
 
-@pytest.mark.parametrize("gait", GAITS)
-@pytest.mark.parametrize("animal", ANIMALS)
+@pytest.mark.parametrize(("animal", "gait"), [(a, m) for a in ANIMALS for m in moves(a)])
 def test_paws_stand_still_and_bones_keep_their_length(animal, gait):
     p = proportions(animal, 3)
-    m = animate(p, gait, T, speed=None, turn=0.2 if gait != "stand" else 0.0, seed=3)
+    m = animate(p, gait, T, speed=None, turn=0.0 if gait in ("stand", *ACTS) else 0.2, seed=3)
     rest = rest_joints(p)
     for i, foot in enumerate(FEET):
         path = m.keypoints[:, KEYPOINTS.index(f"{foot}_paw")]
@@ -42,6 +43,40 @@ def test_paws_stand_still_and_bones_keep_their_length(animal, gait):
     for a, b in legs:
         length = np.linalg.norm(m.keypoints[:, KEYPOINTS.index(a)] - m.keypoints[:, KEYPOINTS.index(b)], axis=1)
         assert np.allclose(length, np.linalg.norm(rest[a] - rest[b]), rtol=1e-6)
+
+
+@pytest.mark.parametrize("act", ACTS)
+@pytest.mark.parametrize("animal", ["dog", "cat"])
+def test_acts_are_what_they_are_called_and_begin_and_end_standing(animal, act):
+    p = proportions(animal, 3)
+    m = animate(p, act, np.arange(270) / 30, speed=None, turn=0.0, seed=3)
+    high = {n: m.keypoints[:, k, 2] / p.height for k, n in enumerate(KEYPOINTS)}
+    begins = {n: z[0] for n, z in high.items()}
+    assert begins["pelvis"] > 0.65
+    assert begins["withers"] > 0.7
+    if act in FOLD:
+        assert high["pelvis"].min() < 0.35
+        assert max(high[f"hind_{s}_hock"].min() for s in ("left", "right")) < 0.12
+        assert high["pelvis"][high["pelvis"].argmin() :].max() > 0.65  # up again
+        assert (high["withers"].min() > 0.6) == (act == "sit")
+        assert (max(high[f"front_{s}_elbow"].min() for s in ("left", "right")) < 0.15) == (act == "lie")
+    if act == "reach":
+        raised = [float(np.ptp(high[f"{foot}_paw"])) for foot in FEET]
+        assert sum(r > 0.2 for r in raised) == 1
+        assert max(raised[2:]) == 0
+    if act == "graze":
+        assert high["nose"].min() < 0.3 < begins["nose"]
+    assert min(z.min() for z in high.values()) > 0
+
+
+def test_a_gallop_flies_and_lands_its_hind_feet_first():
+    m = animate(proportions("dog", 0), "gallop", np.arange(400) / 200, speed=None, turn=0.0, seed=0)
+    assert 0.05 < (m.contact.sum(1) == 0).mean() < 0.6
+    touch = [(int(k), i) for i in range(4) for k in np.flatnonzero(np.diff(m.contact[:, i].astype(int)) == 1)]
+    order = [i for _, i in sorted(touch)]
+    assert len(order) > 8
+    follows = {2: 3, 3: 0, 0: 1, 1: 2}  # hind left, hind right, front left, front right
+    assert all(b == follows[a] for a, b in pairwise(order))
 
 
 def test_a_tempo_plays_the_same_strides_at_another_pace():
@@ -91,6 +126,10 @@ def test_people_stand_still_and_over_their_soles(move):
 def test_who_is_on_the_spot_does_not_travel():
     with pytest.raises(UsageError, match="on the spot"):
         truth(Config(animal="person", gait="squat", speed=1.0))
+    with pytest.raises(UsageError, match="on the spot"):
+        truth(Config(gait="sit", turn=10.0))
+    with pytest.raises(UsageError, match="valid: walk, pace, trot, gallop, stand, reach, graze"):
+        Config(animal="horse", gait="sit")
     with pytest.raises(UsageError, match="valid: walk, run"):
         Config(animal="person", gait="trot")
     z = truth(Config(animal="person", gait="walk", speed=1.2, camera="static", seed=2))

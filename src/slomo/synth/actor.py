@@ -7,10 +7,11 @@ import numpy as np
 
 from slomo.skeleton import load_skeleton
 from slomo.synth import figure
+from slomo.synth.acts import FOLD
 from slomo.synth.animal import ANIMALS, BONES, FEET, KEYPOINTS, proportions
 from slomo.synth.body import build_body
 from slomo.synth.creature import create
-from slomo.synth.gait import GAITS, animate
+from slomo.synth.gait import MOVES, animate
 
 Array = np.ndarray
 
@@ -21,7 +22,9 @@ HEIGHT = 1.55, 1.9  # m, of people
 
 def moves(actor: str) -> tuple[str, ...]:
     """What it can do."""
-    return figure.MOVES if actor == PERSON else tuple(GAITS)
+    if actor == PERSON:
+        return figure.MOVES
+    return tuple(m for m in MOVES if actor != "horse" or m not in FOLD)
 
 
 @dataclass(frozen=True)

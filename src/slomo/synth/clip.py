@@ -31,7 +31,8 @@ class Config:
 
     Attributes:
         animal: "dog", "cat", "horse" or "person"; its proportions and coat, or clothes, vary with the seed.
-        gait: "walk", "pace", "trot" or "stand"; of a person "walk", "run", "stand", "squat", "jack" or "wave".
+        gait: "walk", "pace", "trot", "gallop", or on the spot "stand", "reach" (lifts a front paw), "graze", "sit" and
+            "lie" (down, and up again; not a horse); of a person "walk", "run", "stand", "squat", "jack" or "wave".
         speed: m/s; 0 = the usual speed of the gait.
         turn: degrees/s, positive to the left.
         tempo: "steady", or played "faster" or "slower" (fourfold from one end to the other), or it "stops" after half
@@ -86,7 +87,7 @@ def _staged(config: Config) -> tuple[Actor, np.ndarray, np.ndarray]:
     try:
         actor = act(config.animal, config.gait, played, speed=config.speed or None, turn=turn, seed=config.seed)
     except ValueError as e:
-        raise UsageError(str(e), where="synth", todo="give a lower --speed or another --gait") from None
+        raise UsageError(str(e), where="synth", todo="give a lower --speed, another --gait or another --seed") from None
     K, T_world_cam = camera(
         config.camera, actor.target, t, length=actor.length, view=view, size=size, shake=config.shake, seed=config.seed
     )
