@@ -1,15 +1,14 @@
 """Stride frequencies from the self-similarity of silhouettes, and which gaits are tried."""
 
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from slomo.pinhole import Intrinsics
-from slomo.reconstruct import fit
-from slomo.reconstruct.fit import _diverse
+from slomo.reconstruct import gaits
+from slomo.reconstruct.gaits import SHORTLIST, Laid, diverse, ranked
 from slomo.reconstruct.hypotheses import GRAVITY, GaitHypothesis, gait_grid, gait_pose
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.stride import Steps, steps_of
@@ -122,25 +121,27 @@ def test_the_best_gaits_are_ranked_once_more_with_more_pixels(monkeypatch):
         seen.append(len(guess))
         return torch.tensor([abs(g.phase - 0.5) for g in guess])
 
-    monkeypatch.setattr(fit, "rank", rank)
-    monkeypatch.setattr(fit, "pick", lambda x, which: x)
-    monkeypatch.setattr(fit, "join", lambda guesses: guesses)
-    gaits = [GaitHypothesis("gallop", 1.7, n / 100) for n in range(60)]
-    entries = [(abs(g.phase - 0.4), 0, g, g) for g in gaits]
-    found = fit._ranked(None, {}, entries)  # type: ignore[arg-type]
-    assert found[0][2].phase == 0.5
-    assert sum(seen) == fit.SHORTLIST
-    assert sorted(e[2].phase for e in found) == [g.phase for g in gaits]
-    assert [e[0] for e in found[fit.SHORTLIST :]] == sorted(e[0] for e in entries)[fit.SHORTLIST :]
+    monkeypatch.setattr(gaits, "rank", rank)
+    monkeypatch.setattr(gaits, "pick", lambda x, which: x)
+    monkeypatch.setattr(gaits, "join", lambda guesses: guesses)
+    tried = [GaitHypothesis("gallop", 1.7, n / 100) for n in range(60)]
+    entries = [Laid(abs(g.phase - 0.4), 0, g, g) for g in tried]  # type: ignore[arg-type]
+    found = ranked(None, {}, entries)  # type: ignore[arg-type]
+    assert found[0].gait.phase == 0.5
+    assert sum(seen) == SHORTLIST
+    assert sorted(e.gait.phase for e in found) == [g.phase for g in tried]
+    assert [e.loss for e in found[SHORTLIST:]] == sorted(e.loss for e in entries)[SHORTLIST:]
 
 
 def test_every_gait_is_tried_though_all_phases_of_another_rank_before_it():
-    entries: list[Any] = [(n / 100, 0, GaitHypothesis("gallop", 2.0, n / 12), None) for n in range(12)]
-    entries += [(1.0 + n / 100, 0, GaitHypothesis("trot", 2.0, n / 12), None) for n in range(12)]
-    entries += [(2.0 + n / 100, 0, GaitHypothesis("walk", 2.0, n / 12), None) for n in range(12)]
-    chosen = _diverse(entries, 6)
-    assert [e[2].name for e in chosen[:3]] == ["gallop", "trot", "walk"]
-    assert [e[0] for e in chosen[:3]] == [0.0, 1.0, 2.0]
+    entries = [
+        Laid(worse + n / 100, 0, GaitHypothesis(name, 2.0, n / 12), None)  # type: ignore[arg-type]
+        for worse, name in ((0.0, "gallop"), (1.0, "trot"), (2.0, "walk"))
+        for n in range(12)
+    ]
+    chosen = diverse(entries, 6)
+    assert [e.gait.name for e in chosen[:3]] == ["gallop", "trot", "walk"]
+    assert [e.loss for e in chosen[:3]] == [0.0, 1.0, 2.0]
     assert len(chosen) == 6
-    assert any(e[2] == GaitHypothesis("gallop", 2.0, 6 / 12) for e in chosen)  # the best one's opposite
-    assert [e[2].name for e in _diverse(entries, 2)] == ["gallop", "gallop"]  # and that before another gait
+    assert any(e.gait == GaitHypothesis("gallop", 2.0, 6 / 12) for e in chosen)  # the best one's opposite
+    assert [e.gait.name for e in diverse(entries, 2)] == ["gallop", "gallop"]  # and that before another gait

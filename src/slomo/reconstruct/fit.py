@@ -5,17 +5,16 @@ Every phase is one `optimise` of a batch of hypotheses; between phases they are 
 best go on. All of it is deterministic by the seed, and a checkpoint within any phase resumes to the same bits.
 """
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from slomo.reconstruct import hypotheses, limb_track, pose_track, starts
+from slomo.reconstruct import alike, gaits, hypotheses, limb_track, pose_track, starts
 from slomo.reconstruct.hypotheses import GaitHypothesis, RootGuess
-from slomo.reconstruct.problem import Problem, Schedule, Variables, optimise, pick, rank
+from slomo.reconstruct.problem import Problem, Schedule, optimise, pick, rank
 from slomo.reconstruct.run import Run, checkpoint, join, restore
-from slomo.reconstruct.stride import steps_of
+from slomo.reconstruct.stride import Steps, steps_of
 from slomo.reconstruct.trajectory import Guess
 from slomo.stage import Progress
 
@@ -24,14 +23,11 @@ Tensor = torch.Tensor
 TIE = 0.03  # a rival whose loss is higher by this share may still win in the end
 TURNED = 0.1  # the same of one that faces the other way: short fits say little of that
 STEPS = 0.04  # share by which the loss without a gait must be lower over more than a body length
+ALIKE = 0.01  # share by which the loss with strides that are alike may be higher
 ELSEWHERE = 0.1  # body lengths between the feet of two hypotheses that move their legs otherwise, on average
-CHUNK = 24  # gaits at a time
-SHORTLIST = 48  # of them that are ranked once more
 _MOTION = ("gait", "legs", "seen")
 PHASES = ("heading", "gait", "rivals", "final", "limbs")
 FINAL = PHASES.index("final")  # from there on little is between two hypotheses, and many draws tell them apart
-
-Entry = tuple[float, int, GaitHypothesis, Guess]  # loss, number of the heading that it is laid over, gait, and both
 
 
 @dataclass(frozen=True)
@@ -76,7 +72,7 @@ def fit(
             label | {"loss": round(float(v), 4)} for label, v in zip(run.labels, losses, strict=True)
         ]
         if run.phase == len(PHASES) - 1:
-            return _winner(run, losses)
+            return _winner(run, _alike(run, losses))
         step = (_to_gait, _to_rivals, _to_final, _to_limbs)[run.phase]
         run = step(problem, run, losses, root, effort, metres, progress)
 
@@ -121,16 +117,23 @@ def _to_gait(
     order = losses.argsort()
     keep = [int(order[0])]
     keep += [int(k) for k in order[1:2] if losses[k] < 1.15 * losses[order[0]]]
-    skeleton, kin, obs = problem.kin.skeleton, problem.kin, problem.obs
+    skeleton, kin = problem.kin.skeleton, problem.kin
     speed = float(np.median(root.speed))
-    # The speed of one who stays in place is noise.
-    steps = steps_of(obs, root.speed if root.travelled > 1 else np.ones_like(root.speed))
+    steps = _steps(problem, root)
     grid = hypotheses.gait_grid(steps, skeleton, leg=kin.leg, speed=speed, metres=metres, phases=effort.phases_of_gait)
     run.log["stride_candidates_hz"] = sorted({round(g.frequency, 3) for g in grid})
     run.log["stride_clock_power"] = steps.power
-    t = obs.t.numpy()
-    entries: list[Entry] = []
-    gaits = {g.name: g for g in skeleton.gaits}
+    known = {g.name: g for g in skeleton.gaits}
+    done = effort.schedules[0].iterations * _cost(effort.schedules[0]) / total_cost(effort)
+
+    def pose(g: GaitHypothesis) -> tuple[np.ndarray, np.ndarray]:
+        t = problem.obs.t.numpy()
+        return hypotheses.gait_pose(kin, known[g.name], g, t, clock=steps.clock, speed=root.speed, leg=kin.leg)
+
+    def trying(number: int) -> None:
+        progress.update(done, f"trying {len(grid)} gaits: {number}")
+
+    entries: list[gaits.Laid] = []
     postures, posture_names = hypotheses.posture_angles(kin)
     posed: list[Guess] = []
     for k in keep:
@@ -148,79 +151,23 @@ def _to_gait(
             base, best = guess.pick(value.argmin()[None]), int(value.argmin())
         run.labels[k] = run.labels[k] | {"posture": posture_names[best]}
         posed.append(base)
-        for i in range(0, len(grid), CHUNK):
-            chunk = grid[i : i + CHUNK]
-            poses = [
-                hypotheses.gait_pose(kin, gaits[g.name], g, t, clock=steps.clock, speed=root.speed, leg=kin.leg)
-                for g in chunk
-            ]
-            guess = _lay(base, poses)
-            value = rank(problem, pick(run.x, one.expand(len(chunk))), guess, draws=1, frames=16, pixels=128)
-            entries += [
-                (float(v), k, g, guess.pick(torch.tensor([n])))
-                for n, (v, g) in enumerate(zip(value, chunk, strict=True))
-            ]
-            done = effort.schedules[0].iterations * _cost(effort.schedules[0])
-            progress.update(done / total_cost(effort), f"trying {len(grid)} gaits: {i}")
-    entries = _ranked(problem, run.x, entries)
-    chosen = _diverse(entries, max(0, effort.candidates - len(keep)))
-    which = torch.tensor(keep + [k for _, k, _, _ in chosen])
-    guesses = posed + [g for *_, g in chosen]
+        entries += gaits.lay(problem, pick(run.x, one), k, base, grid, pose, trying)
+    entries = gaits.ranked(problem, run.x, entries)
+    chosen = gaits.diverse(entries, max(0, effort.candidates - len(keep)))
+    which = torch.tensor(keep + [e.heading for e in chosen])
+    guesses = posed + [e.guess for e in chosen]
     labels = [run.labels[k] | {"gait": "none"} for k in keep]
     labels += [
-        run.labels[k] | {"gait": g.name, "stride_hz": round(g.frequency, 3), "phase": round(g.phase, 3)}
-        for _, k, g, _ in chosen
+        run.labels[e.heading]
+        | {"gait": e.gait.name, "stride_hz": round(e.gait.frequency, 3), "phase": round(e.gait.phase, 3)}
+        for e in chosen
     ]
     return Run(1, pick(run.x, which), join(guesses), labels, run.log)
 
 
-def _ranked(problem: Problem, x: Variables, entries: list[Entry]) -> list[Entry]:
-    """The entries in order of their losses, the best of them once more with more draws: what is between one phase of a
-    gait and the next is less than the noise of the few pixels that all are compared by, and from the wrong one of them
-    the fit does not come back."""
-    entries = sorted(entries, key=lambda e: e[0])
-    first = []
-    for i in range(0, min(SHORTLIST, len(entries)), CHUNK):
-        part = entries[i : min(i + CHUNK, SHORTLIST)]
-        wide = pick(x, torch.tensor([k for _, k, _, _ in part]))
-        value = rank(problem, wide, join([guess for *_, guess in part]), draws=2, frames=40)
-        first += [(float(v), *entry[1:]) for v, entry in zip(value, part, strict=True)]
-    return sorted(first, key=lambda e: e[0]) + entries[SHORTLIST:]
-
-
-def _lay(base: Guess, poses: list[tuple[np.ndarray, np.ndarray]]) -> Guess:
-    f = lambda x: torch.as_tensor(np.stack(x), dtype=torch.float32)  # noqa: E731
-    n = len(poses)
-    wide = base.pick(torch.zeros(n, dtype=torch.long))
-    return replace(wide, q=base.q + f([q for q, _ in poses]), stance=f([c for _, c in poses]))
-
-
-def _diverse(entries: list[Entry], count: int) -> list[Entry]:
-    """The best entry of every gait, for what is laid over the body as it is may rank a wrong gait first in all its
-    phases; then the best that differ in phase by a sixth, in frequency by a fifth, or in heading; and the best one's
-    left-right opposite, so that a swap of the legs is always weighed against it."""
-
-    def far(a: GaitHypothesis, b: GaitHypothesis) -> bool:
-        turn = abs((a.phase - b.phase + 0.5) % 1.0 - 0.5)
-        return a.name != b.name or turn > 1 / 6.5 or abs(math.log(a.frequency / b.frequency)) > 0.15
-
-    firsts = {e[2].name: e for e in reversed(entries)}
-    out = sorted(firsts.values(), key=lambda e: e[0])[:count]
-    for e in entries:
-        if len(out) == count:
-            break
-        if all(e[1] != o[1] or far(e[2], o[2]) for o in out):
-            out.append(e)
-    if out:
-        best = out[0]
-        opposite = [
-            e for e in entries
-            if e[1] == best[1] and e[2].name == best[2].name and e[2].frequency == best[2].frequency
-            and abs(abs(e[2].phase - best[2].phase) - 0.5) < 1e-6
-        ]  # fmt: skip
-        if opposite and all(o is not opposite[0] for o in out):
-            out[-1 if len(out) == count else len(out) :] = opposite
-    return out
+def _steps(problem: Problem, root: RootGuess) -> Steps:
+    # The speed of one who stays in place is noise.
+    return steps_of(problem.obs, root.speed if root.travelled > 1 else np.ones_like(root.speed))
 
 
 def _to_rivals(problem: Problem, run: Run, losses: Tensor, root: RootGuess, *_) -> Run:
@@ -267,6 +214,11 @@ def _stepping(run: Run, losses: Tensor, root: RootGuess) -> Tensor:
     return losses * torch.tensor([1 + STEPS * (label["gait"] == "none") for label in run.labels])
 
 
+def _alike(run: Run, losses: Tensor) -> Tensor:
+    """(H,) losses to compare by. Where the picture leaves it open strides are alike: their loss may be higher."""
+    return losses * torch.tensor([1 - ALIKE * ("strides" in label) for label in run.labels])
+
+
 def _feet_apart(problem: Problem, run: Run, one: int) -> Tensor:
     """(H,) mean distance of the feet of each hypothesis from those of `one`, body lengths."""
     with torch.no_grad():
@@ -279,14 +231,23 @@ def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effor
     """The best one goes on, beside it with limbs that are where they are seen better by now, where any are and there is
     time for it."""
     best = _winner(run, _stepping(run, losses, root))
-    found = None
-    if problem.kin.skeleton.kind == "quadruped" and effort.schedules[-1].iterations:
-        found = limb_track.by_limb(problem, best.x, best.guess, leave=limb_track.LIKELY)
-    if found is None:
-        return replace(best, phase=run.phase + 1)
-    x = {k: torch.cat([v, found[0][k]]) for k, v in best.x.items()}
-    labels = [*best.labels, best.labels[0] | {"limbs": "on their own"}]
-    return Run(run.phase + 1, x, join([best.guess, found[1]]), labels, run.log)
+    rivals = [(best.x, best.guess)]
+    labels = list(best.labels)
+    if effort.schedules[-1].iterations:
+        if problem.kin.skeleton.kind == "quadruped":
+            found = limb_track.by_limb(problem, best.x, best.guess, leave=limb_track.LIKELY)
+            if found is not None:
+                rivals.append(found)
+                labels.append(labels[0] | {"limbs": "on their own"})
+        if labels[0]["gait"] != "none" or root.travelled > 1:
+            clock = _steps(problem, root).clock
+            hz = [labels[0]["stride_hz"]] if "stride_hz" in labels[0] else run.log["stride_candidates_hz"]
+            found = alike.borrowed(problem, *rivals[-1], clock=clock, frequencies=hz)
+            if found is not None:
+                rivals.append(found)
+                labels.append(labels[-1] | {"strides": "alike"})
+    x = {k: torch.cat([x[k] for x, _ in rivals]) for k in best.x}
+    return Run(run.phase + 1, x, join([guess for _, guess in rivals]), labels, run.log)
 
 
 def _winner(run: Run, losses: Tensor) -> Run:

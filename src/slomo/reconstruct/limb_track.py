@@ -71,7 +71,7 @@ def _path(
     elsewhere = ~np.isnan(places)
     pitch = np.stack([np.zeros_like(places), np.nan_to_num(places), np.zeros_like(places)], -1)
     angles = np.where(elsewhere[None, :, :, None], pitch, own[:, None])
-    cost = _costs(problem, x, guess, chain, angles) * RATE * float(obs.dt.median())
+    cost = costs(problem, x, guess, chain, angles) * RATE * float(obs.dt.median())
     flexion = angles[..., 1]
     turn = np.abs(flexion[1:, None] - flexion[:-1, :, None])  # (F - 1, from, to, J)
     turn *= elsewhere[:, None] | elsewhere  # its own motion costs nothing
@@ -95,7 +95,7 @@ def _postures(problem: Problem, chain: list[int]) -> Array:
     return np.array([(math.nan,) * k + p for k in range(J, -1, -1) for p in itertools.product(*values[k:])])
 
 
-def _costs(problem: Problem, x: Variables, guess: Guess, chain: list[int], angles: Array) -> Array:
+def costs(problem: Problem, x: Variables, guess: Guess, chain: list[int], angles: Array) -> Array:
     """(F, N) how badly the limb `chain` is seen in each fit frame with each of the angles (F, N, J, 3) rad."""
     obs, w = problem.obs, problem.weights
     F, N = angles.shape[:2]

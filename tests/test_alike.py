@@ -1,0 +1,91 @@
+"""Strides done as others of them were, on drawn silhouettes and on bare costs."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from slomo.reconstruct import alike, hypotheses
+from slomo.reconstruct.kinematics import Kinematics
+from slomo.skeleton import load_skeleton
+from test_fit_people import FPS, T, problem_of
+
+STRIDE = 6  # frames
+CLOCK = np.arange(T) / FPS
+CENTRE = np.array([0.0, -4.5, 0.6])  # of a camera that sees the right flank
+RAISED = {"front_right_shoulder": -40.0, "front_right_elbow": -85.0}
+INF = math.inf
+
+
+def raising(strides) -> np.ndarray:
+    """(T, B, 3) rad of a dog that raises its right front paw in the middle of these strides."""
+    kin = Kinematics(load_skeleton("quadruped"))
+    q = np.zeros((T, kin.B, 3))
+    for k in strides:
+        for joint, degrees in RAISED.items():
+            q[k * STRIDE + 2 : k * STRIDE + 5, kin.skeleton.names.index(joint), 1] = np.radians(degrees)
+    return q
+
+
+def done(seen, fitted, frequencies=(FPS / STRIDE,)) -> np.ndarray | None:
+    """(T,) degrees of the elbow after strides were borrowed; a paw is seen up in some strides and fitted so in some."""
+    problem, root = problem_of(np.zeros(T), raising(seen), skeleton="quadruped", centre=CENTRE)
+    guess = hypotheses.placed(problem.kin, root, np.zeros((1, T)))
+    guess = replace(guess, q=torch.as_tensor(raising(fitted), dtype=torch.float32)[None])
+    x = problem.variables(1, torch.Generator().manual_seed(0))
+    found = alike.borrowed(problem, x, guess, clock=CLOCK, frequencies=frequencies)
+    elbow = problem.kin.skeleton.names.index("front_right_elbow")
+    return None if found is None else np.degrees(found[1].q[0, :, elbow, 1].numpy())
+
+
+@pytest.mark.parametrize("missed", [1, 2])
+def test_a_step_that_is_missed_is_done_as_the_others(missed):
+    elbow = done(seen=range(4), fitted=[k for k in range(4) if k != missed])
+    assert elbow is not None
+    for k in range(4):
+        assert elbow[k * STRIDE + 3] < -60
+        assert abs(elbow[k * STRIDE]) < 35
+
+
+def test_a_step_that_is_seen_to_be_another_stays_so():
+    assert done(seen=[0, 1, 3], fitted=[0, 1, 3]) is None
+    assert done(seen=range(4), fitted=range(4)) is None
+
+
+def test_without_two_strides_nothing_is_borrowed():
+    assert done(seen=range(4), fitted=[0, 1, 3], frequencies=(0.4,)) is None
+
+
+def test_the_stride_is_the_shortest_period_that_is_as_good():
+    t = np.arange(0, 6, 1 / 30)
+    twice = np.stack([np.sin(2 * np.pi * 1.5 * t), np.cos(2 * np.pi * 1.5 * t)], 1)
+    assert alike._period(twice, t, (0.75, 1.5)) == pytest.approx(1 / 1.5, rel=0.02)
+    other = np.stack([np.sin(2 * np.pi * 1.5 * t), np.cos(2 * np.pi * 0.75 * t)], 1)
+    assert alike._period(other, t, (0.75, 1.5)) == pytest.approx(1 / 0.75, rel=0.02)
+
+
+def test_what_costs_little_where_it_is_hidden_and_much_where_it_is_seen_goes():
+    """Strides 0, 1 and 3 are done in one way, 2 and 4 in another. The first would cost much in 2 and 4, the second
+    nothing anywhere: all are done in the second, though most were done in the first."""
+    first, second = [0, 1, 3], [2, 4]
+    dearer = np.zeros((5, 5))
+    dearer[np.ix_(first, second)] = 0.022
+    dearer[np.ix_(second, first)] = 0.002
+    apart = np.full((5, 5), 0.05)
+    apart[np.ix_(first, second)] = apart[np.ix_(second, first)] = 0.4
+    share = np.full(5, 0.2)
+    choice = alike._choose(dearer, apart, np.arange(5), share)
+    assert set(choice) <= {2, 4}
+    kept = alike._choose(10 * dearer, apart, np.arange(5), share)  # seen to be done in two ways
+    assert {kept[j] for j in first} <= set(first)
+    assert {kept[j] for j in second} <= set(second)
+
+
+def test_strides_that_are_no_template_may_be_done_as_one_and_templates_need_not():
+    dearer = np.array([[0.0, -0.03, 0.0], [INF, 0.02, 0.0]])  # of strides 0 and 2
+    apart = np.array([[0.0, 0.4, 0.1], [0.1, 0.4, 0.0]])
+    choice = alike._choose(dearer, apart, np.array([0, 2]), np.full(3, 1 / 3))
+    assert choice[1] == 0
+    assert choice[0] == 0
