@@ -89,3 +89,13 @@ def test_strides_that_are_no_template_may_be_done_as_one_and_templates_need_not(
     choice = alike._choose(dearer, apart, np.array([0, 2]), np.full(3, 1 / 3))
     assert choice[1] == 0
     assert choice[0] == 0
+    dearer[:, 1] = 0.05
+    assert alike._choose(dearer, apart, np.array([0, 2]), np.full(3, 1 / 3))[1] is None
+
+
+def test_of_many_strides_a_few_are_templates(monkeypatch):
+    monkeypatch.setattr(alike, "TEMPLATES", 2)
+    elbow = done(seen=range(4), fitted=[0, 1, 3])
+    assert elbow is not None
+    assert all(elbow[k * STRIDE + 3] < -60 for k in range(4))
+    assert done(seen=[0, 1, 3], fitted=[0, 1, 3]) is None

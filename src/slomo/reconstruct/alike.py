@@ -104,7 +104,7 @@ def _of_limb(
     choice = _choose(np.where(whole, dearer, math.inf), apart, sources, share)
     change = np.zeros_like(own)
     for j, s in enumerate(choice):
-        if sources[s] != j and apart[s, j] > LEAST:
+        if s is not None and sources[s] != j and apart[s, j] > LEAST:
             change[number == j] = (done[:, s] - own)[number == j]
     return (chain, change.reshape(len(q), -1, 3)) if change.any() else nothing
 
@@ -119,8 +119,8 @@ def _cut(own: Array, clock: Array, period: float) -> float:
     return float(places[int(np.argmin(spread))])
 
 
-def _choose(dearer: Array, apart: Array, sources: Array, share: Array) -> list[int]:
-    """Which of S sources each of n strides is done as.
+def _choose(dearer: Array, apart: Array, sources: Array, share: Array) -> list[int | None]:
+    """Which of S sources each of n strides is done as; None where it is no source and stays what it is.
 
     Args:
         dearer: (S, n) what a frame costs more then, inf where it cannot be.  apart: (S, n) rad between that and what it
@@ -157,4 +157,4 @@ def _choose(dearer: Array, apart: Array, sources: Array, share: Array) -> list[i
                 break
         if total(choice) < total(best) - 1e-12:
             best = choice
-    return [int(s) for s in best]
+    return [int(s) if s < len(sources) else None for s in best]
