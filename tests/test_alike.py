@@ -56,6 +56,7 @@ def test_a_step_that_is_seen_to_be_another_stays_so():
 
 def test_without_two_strides_nothing_is_borrowed():
     assert done(seen=range(4), fitted=[0, 1, 3], frequencies=(0.4,)) is None
+    assert done(seen=range(4), fitted=[0, 1, 3], frequencies=()) is None
 
 
 def test_the_stride_is_the_shortest_period_that_is_as_good():

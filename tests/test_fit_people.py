@@ -8,11 +8,12 @@ import torch
 
 from slomo.pinhole import Intrinsics
 from slomo.prior.labels import BINS
-from slomo.reconstruct import hypotheses, losses, pose_track, silhouette
+from slomo.reconstruct import fit, hypotheses, losses, pose_track, silhouette
 from slomo.reconstruct.evidence import gather
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.observations import observe
 from slomo.reconstruct.problem import Problem
+from slomo.reconstruct.run import Run
 from slomo.reconstruct.trajectory import Guess, Trajectory
 from slomo.skeleton import load_skeleton
 
@@ -148,3 +149,11 @@ def test_who_is_turned_around_is_the_reflection_in_depth(raising):
     torch.testing.assert_close(after, reflected, atol=1e-4, rtol=0)
     assert (after - before).norm(dim=-1).max() > 0.2
     torch.testing.assert_close(nodes(*hypotheses.turned_around(problem, *once)), before, atol=1e-4, rtol=0)
+
+
+def test_headings_are_told_apart_by_how_far_they_are_turned(raising):
+    problem, root = raising
+    yaw = np.radians([170.0, -175.0, 90.0])[:, None] * np.ones(T)
+    x = problem.variables(3, torch.Generator().manual_seed(0))
+    run = Run(0, x, hypotheses.placed(problem.kin, root, yaw), [{}, {}, {}])
+    assert np.degrees(fit._turned(problem, run, 0).numpy()) == pytest.approx([0, 15, 80], abs=0.1)

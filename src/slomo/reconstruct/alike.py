@@ -59,7 +59,7 @@ def borrowed(
 def _period(flexion: Array, clock: Array, frequencies: Sequence[float]) -> float | None:
     """s of the clock after which the legs' flexion (T, J) is most like before: the shortest of those after which it is
     about as much so. None where there are not two such strides."""
-    about = np.concatenate([np.linspace((1 - OFF) / f, (1 + OFF) / f, 81) for f in frequencies])
+    about = np.concatenate([np.zeros(0), *(np.linspace((1 - OFF) / f, (1 + OFF) / f, 81) for f in frequencies)])
     about = np.sort(about[about <= (clock[-1] - clock[0]) / 2])
     if not len(about):
         return None

@@ -5,6 +5,7 @@ Every phase is one `optimise` of a batch of hypotheses; between phases they are 
 best go on. All of it is deterministic by the seed, and a checkpoint within any phase resumes to the same bits.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +23,7 @@ Tensor = torch.Tensor
 
 TIE = 0.03  # a rival whose loss is higher by this share may still win in the end
 TURNED = 0.1  # the same of one that faces the other way: short fits say little of that
+SAME = math.radians(10.0)  # headings that differ by less are one
 STEPS = 0.04  # share by which the loss without a gait must be lower over more than a body length
 ALIKE = 0.01  # share by which the loss with strides that are alike may be higher
 ELSEWHERE = 0.1  # body lengths between the feet of two hypotheses that move their legs otherwise, on average
@@ -113,10 +115,12 @@ def _to_gait(
     metres: float | None,
     progress: Progress,
 ) -> Run:
-    """Lay postures and gaits over the best heading (two when close), rank them as they are, keep the best few."""
-    order = losses.argsort()
-    keep = [int(order[0])]
-    keep += [int(k) for k in order[1:2] if losses[k] < 1.15 * losses[order[0]]]
+    """Lay postures and gaits over the best heading (and another one when it is close), rank them as they are, keep the
+    best few."""
+    order = losses.argsort().tolist()
+    away = _turned(problem, run, order[0]).tolist()
+    close = [k for k in order[1:] if losses[k] < 1.15 * losses[order[0]] and away[k] > SAME]
+    keep = order[:1] + close[:1]
     skeleton, kin = problem.kin.skeleton, problem.kin
     speed = float(np.median(root.speed))
     steps = _steps(problem, root)
@@ -163,6 +167,14 @@ def _to_gait(
         for e in chosen
     ]
     return Run(1, pick(run.x, which), join(guesses), labels, run.log)
+
+
+def _turned(problem: Problem, run: Run, one: int) -> Tensor:
+    """(H,) rad, by how much the heading of each hypothesis differs from that of `one`, the median over the clip."""
+    with torch.no_grad():
+        _, R, _ = problem.path(run.x, run.guess, run.x["shape.log_length"].exp(), problem.obs.at)
+    ahead = torch.nn.functional.normalize(R[..., :2, 0], dim=-1)
+    return torch.acos((ahead * ahead[one]).sum(-1).clamp(-1, 1)).median(1).values
 
 
 def _steps(problem: Problem, root: RootGuess) -> Steps:
