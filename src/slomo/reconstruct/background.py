@@ -10,7 +10,7 @@ from slomo.reconstruct.tracks import Tracks
 
 _NOISE = 9.0  # levels (of 255) in RGB that noise and sub-pixel shifts leave
 _UNLIKE = 2.7  # times those levels, from which on nothing but shade explains a pixel by the background
-_SHADOW = (0.3, 0.95)  # a cast shadow multiplies the ground's colour by a factor in this range
+SHADOW = (0.3, 0.95)  # a cast shadow multiplies the ground's colour by a factor in this range
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,13 @@ class Overlay:
 
 
 def log_odds(
-    now: np.ndarray, median: np.ndarray, spread: np.ndarray, noise: float = _NOISE, *, shade: float = -2.0
+    now: np.ndarray,
+    median: np.ndarray,
+    spread: np.ndarray,
+    noise: float = _NOISE,
+    *,
+    shade: float = -2.0,
+    darkest: float = SHADOW[0],
 ) -> np.ndarray:
     """(h, w) about -2 to 4, that a pixel is no background.
 
@@ -77,11 +83,17 @@ def log_odds(
         now, median: (h, w, 3) RGB, now and in the background.  spread: (h, w), levels by which samples of the
             background differ.  noise: levels that always are.
         shade: least value where only shade makes the background look like that: a dark body may look so too.
+        darkest: least factor by which shade multiplies the background.
     """
     size, level = np.linalg.norm(now - median, axis=-1), noise + 1.5 * spread
-    factor = (now * median).sum(-1) / np.maximum((median**2).sum(-1), 1.0)
-    shaded = (factor > _SHADOW[0]) & (factor < _SHADOW[1])
+    factor = shade_factor(now, median)
+    shaded = (factor > darkest) & (factor < SHADOW[1])
     ratio = np.where(shaded, np.linalg.norm(now - factor[..., None] * median, axis=-1), size) / level
     trust = np.clip(2.0 - spread / noise, 0.0, 1.0)  # of "like the background": nothing where samples disagree
     odds = np.clip(np.where(ratio > 2.0, 1.5 * (ratio - 2.0), trust * (ratio - 2.0)), -2.0, 4.0)
     return np.where(shaded & (size > _UNLIKE * level), np.maximum(odds, shade), odds)
+
+
+def shade_factor(now: np.ndarray, median: np.ndarray) -> np.ndarray:
+    """(h, w) by which the background (h, w, 3) is multiplied to look most like (h, w, 3) now."""
+    return (now * median).sum(-1) / np.maximum((median**2).sum(-1), 1.0)

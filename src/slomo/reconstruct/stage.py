@@ -13,7 +13,7 @@ from slomo.reconstruct.video import decode
 from slomo.stage import Artifact, Inputs, Progress
 
 DECODE_VERSION = 2
-MASKS_VERSION = 13
+MASKS_VERSION = 14
 CAMERA_VERSION = 7
 QUALITIES = ("draft", "normal", "high")
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from slomo.reconstruct.background import log_odds
+from slomo.reconstruct.background import SHADOW, log_odds, shade_factor
 from slomo.reconstruct.colour import learn_colours, to_lab
 from slomo.reconstruct.flow import Flow
 from slomo.reconstruct.instances import Choice, follow
@@ -31,6 +31,8 @@ _SOFT_PX = 0.8  # of the smoothing before frames are compared
 _SEEN = 0.6  # of the time, for which the subject may cover a place whose background is known
 _LEAST = 0.0015  # of the picture, a subject
 _SHADE = -0.1  # log odds of what could be the background in shade: the colours decide, a dark coat looks so too
+_PATTERN = 0.85  # correlation with the background, of what shows its pattern
+_SHADOWS = 200  # pixels of that, which tell how dark shadows are
 _SURELY = 2.0  # log odds, of what belongs to the subject though nothing joins it
 
 
@@ -63,7 +65,8 @@ class StillSegmenter:
         body: dict[int, np.ndarray] = {}
         for turn in range(self.rounds):
             median, spread = _background(frames, covered, sampled)
-            differs = {t: log_odds(_soft(frames[t]), median, spread, _NOISE, shade=_SHADE) for t in range(T)}
+            darkest = _darkest_shade(frames, body, median, spread) if body else SHADOW[0]
+            differs = {t: _differs(frames[t], median, spread, darkest) for t in range(T)}
             if not body:
                 body = follow({t: _pieces(d) for t, d in differs.items()}, flow, self.choice)
             seen = {t: b for t, b in body.items() if b.mean() > 0.3 * _LEAST}
@@ -121,6 +124,34 @@ def _background(frames: np.ndarray, covered: np.ndarray, sampled: np.ndarray) ->
         apart = np.sort(np.where(hidden, np.inf, np.abs(row - median[y]).mean(-1)), axis=0)
         spread[y] = np.take_along_axis(apart, middle[None], 0)[0]
     return median, spread
+
+
+def _differs(frame: np.ndarray, median: np.ndarray, spread: np.ndarray, darkest: float) -> np.ndarray:
+    return log_odds(_soft(frame), median, spread, _NOISE, shade=_SHADE, darkest=darkest)
+
+
+def _darkest_shade(frames: np.ndarray, body: dict[int, np.ndarray], median: np.ndarray, spread: np.ndarray) -> float:
+    """The factor that cast shadows of this clip are not darker than.
+
+    One light makes shadows of one depth, and they keep the pattern of what they fall on, which a coat does not. A dark
+    coat may look like any shade; what is darker than the darkest shadow is the coat.
+    """
+    found = []
+    for t in list(body)[:: max(1, len(body) // _SAMPLES)]:
+        now = _soft(frames[t])
+        open_ = np.abs(_differs(frames[t], median, spread, SHADOW[0]) - _SHADE) < 1e-6
+        pattern = open_ & grown(body[t], 0.3) & (_alike(now.mean(-1), median.mean(-1)) > _PATTERN)
+        found.append(shade_factor(now, median)[pattern])
+    factors = np.concatenate(found)
+    return max(SHADOW[0], float(np.quantile(factors, 0.1)) - 0.08) if len(factors) > _SHADOWS else SHADOW[0]
+
+
+def _alike(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(H, W) correlation of two pictures (H, W) around every pixel."""
+    mean = lambda x: cv2.boxFilter(x.astype(np.float32), -1, (9, 9))  # noqa: E731
+    ma, mb = mean(a), mean(b)
+    va, vb = mean(a * a) - ma * ma, mean(b * b) - mb * mb
+    return np.where(vb > 9.0, (mean(a * b) - ma * mb) / np.sqrt(np.maximum(va * vb, 1e-6)), 0.0)
 
 
 def _trimmed(mask: np.ndarray, frame: np.ndarray, median: np.ndarray) -> np.ndarray:
