@@ -167,6 +167,13 @@ def test_the_right_heading_costs_less_than_a_turned_one(scene: Scene, name: str)
         assert right < 0.8 * scene.value(name, dataclasses.replace(scene.true, yaw=scene.true.yaw + turn))
 
 
+def test_the_view_may_be_off_by_twenty_degrees_and_not_by_forty(scene: Scene):
+    turned = [
+        scene.value("view", dataclasses.replace(scene.true, yaw=scene.true.yaw + np.radians(a))) for a in (0, 15, 40)
+    ]
+    assert turned[1] - turned[0] < 0.1 * (turned[2] - turned[0])
+
+
 def test_key_points_that_are_met_cost_nothing_and_the_surface_next_to(scene: Scene):
     assert scene.value("keypoints", scene.true) < 1e-4
     assert scene.value("surface", scene.true) < 0.05

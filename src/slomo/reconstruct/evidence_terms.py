@@ -22,6 +22,7 @@ Tensor = torch.Tensor
 DOUBT = 0.1  # share of a uniform distribution that the view's is mixed with
 CONCENTRATION = 33.0  # of the kernel between azimuth bins: about one bin wide
 VIEW_UNIT = 3.0  # nats
+ERRS = 2  # bins, of 10 degrees, by which the view of a whole clip may be off
 UP_UNIT = 1 - math.cos(math.radians(20.0))
 UP_SHARE = 0.2  # of the body's up axis in the view term
 PART_PX = 5.0
@@ -42,6 +43,12 @@ def doubtful(view: Tensor) -> Tensor:
     return (nats - nats.amin(-1, keepdim=True)) / VIEW_UNIT
 
 
+def widened(table: Tensor) -> Tensor:
+    """(..., 36) the least of a table over azimuth bins within `ERRS` bins of each: a network misjudges the length or
+    the width of one body by the same angle in every frame, and no number of frames outweighs that."""
+    return torch.stack([table.roll(n, -1) for n in range(-ERRS, ERRS + 1)]).amin(0)
+
+
 def at_azimuth(table: Tensor, azimuth: Tensor) -> Tensor:
     """(H, F) values of a table (F, 36) over azimuth bins at azimuth (H, F) rad, smooth (von Mises kernel)."""
     centres = torch.arange(BINS) * (2 * math.pi / BINS)
@@ -54,7 +61,7 @@ def view(e: Evidence, s: State) -> Tensor:
     to_body = s.body.nodes[:, :, e.trunk].mean(2) - s.centre
     to_camera = -(to_body[..., None, :] @ s.R_root)[..., 0, :]
     azimuth = torch.atan2(to_camera[..., 1], to_camera[..., 0])
-    miss = at_azimuth(doubtful(e.view), azimuth)
+    miss = at_azimuth(widened(doubtful(e.view)), azimuth)
     # Into the view frame: the least turn that brings the direction to the body onto the optical axis (Rodrigues).
     z = torch.nn.functional.normalize((s.R_cam @ to_body[..., None])[..., 0], dim=-1)
     up = (s.R_cam @ s.R_root[..., 2:])[..., 0]

@@ -21,7 +21,7 @@ from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import Skeleton, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 30
+FIT_VERSION = 32
 
 AGAIN = 0.5  # share of the rates with which the winner is fitted once more, beside one with other limbs
 POLISH = 0.4  # share of the rates with which the chunks of a long clip are polished together
@@ -59,7 +59,7 @@ class FitConfig:
     root_hz: float = 2.5
     quality: str = "normal"
     iterations: tuple[int, ...] = ()
-    candidates: int = 8
+    candidates: int = 10
     gait_phases: int = 12
     tilt_moving_deg: float = 0.7
     tilt_static_deg: float = 4.0
