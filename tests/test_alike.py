@@ -100,3 +100,8 @@ def test_of_many_strides_a_few_are_templates(monkeypatch):
     assert elbow is not None
     assert all(elbow[k * STRIDE + 3] < -60 for k in range(4))
     assert done(seen=[0, 1, 3], fitted=[0, 1, 3]) is None
+
+
+def test_a_stride_without_a_frame_has_no_mean():
+    means = alike._means(np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), np.array([0, 0, 2]), 3)
+    assert means.tolist() == [[2.0, INF, 5.0], [3.0, INF, 6.0]]

@@ -98,8 +98,8 @@ def _of_limb(
     away = np.linalg.norm(done - own[:, None], axis=-1)
     strides = range(count)
     whole = np.stack([there[number == j].all(0) for j in strides], 1)  # (S, strides)
-    dearer = np.stack([(cost[:, 1:] - cost[:, :1])[number[at] == j].mean(0) for j in strides], 1)
-    apart = np.stack([away[number == j].mean(0) for j in strides], 1)
+    dearer = _means(cost[:, 1:] - cost[:, :1], number[at], count)
+    apart = _means(away, number, count)
     share = np.bincount(number) / len(number)
     choice = _choose(np.where(whole, dearer, math.inf), apart, sources, share)
     change = np.zeros_like(own)
@@ -107,6 +107,14 @@ def _of_limb(
         if s is not None and sources[s] != j and apart[s, j] > LEAST:
             change[number == j] = (done[:, s] - own)[number == j]
     return (chain, change.reshape(len(q), -1, 3)) if change.any() else nothing
+
+
+def _means(values: Array, number: Array, count: int) -> Array:
+    """(S, count) means of values (F, S) over the frames of each stride, inf of a stride without any."""
+    total = np.zeros((count, values.shape[1]))
+    np.add.at(total, number, values)
+    frames = np.bincount(number, minlength=count)[:, None]
+    return np.where(frames > 0, total / np.maximum(frames, 1), math.inf).T
 
 
 def _cut(own: Array, clock: Array, period: float) -> float:
