@@ -46,13 +46,12 @@ def borrowed(
     period = _period(q[:, sorted({j for chain in limbs for j in chain}), 1], clock, frequencies)
     if period is None:
         return None
-    found = [_of_limb(problem, x, guess, q, clock, period, chain) for chain in limbs]
-    if not any(len(change) for _, change in found):
+    changes = [_of_limb(problem, x, guess, q, clock, period, chain) for chain in limbs]
+    if not any(change.any() for change in changes):
         return None
     step = int(problem.obs.at[1] - problem.obs.at[0])
-    for chain, change in found:
-        if len(change):
-            q[:, chain] += smooth(change.reshape(len(q), -1), 2 * step + 1).reshape(change.shape)
+    for chain, change in zip(limbs, changes, strict=True):
+        q[:, chain] += smooth(change, 2 * step + 1).reshape(len(q), -1, 3)
     return x, replace(guess, q=torch.as_tensor(q, dtype=torch.float32)[None])
 
 
@@ -80,9 +79,8 @@ def _at(motion: Array, clock: Array, then: Array) -> Array:
 
 def _of_limb(
     problem: Problem, x: Variables, guess: Guess, q: Array, clock: Array, period: float, chain: list[int]
-) -> tuple[list[int], Array]:
-    """The chain, and what is added to its angles (T, J, 3) rad; nothing (0,) where all stays as it is."""
-    nothing = chain, np.zeros(0)
+) -> Array:
+    """(T, 3 J) rad, what is added to the angles of a limb's links `chain`; zeros in strides that stay as they are."""
     own = q[:, chain].reshape(len(q), -1)
     cut = clock[0] + period * _cut(own, clock, period)
     number = np.floor((clock - cut) / period).astype(int)
@@ -96,8 +94,7 @@ def _of_limb(
     angles = np.concatenate([own[:, None], done], 1)[at].reshape(len(at), 1 + len(sources), len(chain), 3)
     cost = limb_track.costs(problem, x, guess, chain, angles)
     away = np.linalg.norm(done - own[:, None], axis=-1)
-    strides = range(count)
-    whole = np.stack([there[number == j].all(0) for j in strides], 1)  # (S, strides)
+    whole = np.stack([there[number == j].all(0) for j in range(count)], 1)  # (S, strides)
     dearer = _means(cost[:, 1:] - cost[:, :1], number[at], count)
     apart = _means(away, number, count)
     share = np.bincount(number) / len(number)
@@ -106,7 +103,7 @@ def _of_limb(
     for j, s in enumerate(choice):
         if s is not None and sources[s] != j and apart[s, j] > LEAST:
             change[number == j] = (done[:, s] - own)[number == j]
-    return (chain, change.reshape(len(q), -1, 3)) if change.any() else nothing
+    return change
 
 
 def _means(values: Array, number: Array, count: int) -> Array:

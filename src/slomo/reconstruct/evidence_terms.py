@@ -22,7 +22,7 @@ Tensor = torch.Tensor
 DOUBT = 0.1  # share of a uniform distribution that the view's is mixed with
 CONCENTRATION = 33.0  # of the kernel between azimuth bins: about one bin wide
 VIEW_UNIT = 3.0  # nats
-ERRS = 2  # bins, of 10 degrees, by which the view of a whole clip may be off
+VIEW_OFF = 2  # bins of 10 degrees, by which the view of a whole clip may be off
 UP_UNIT = 1 - math.cos(math.radians(20.0))
 UP_SHARE = 0.2  # of the body's up axis in the view term
 PART_PX = 5.0
@@ -44,9 +44,9 @@ def doubtful(view: Tensor) -> Tensor:
 
 
 def widened(table: Tensor) -> Tensor:
-    """(..., 36) the least of a table over azimuth bins within `ERRS` bins of each: a network misjudges the length or
-    the width of one body by the same angle in every frame, and no number of frames outweighs that."""
-    return torch.stack([table.roll(n, -1) for n in range(-ERRS, ERRS + 1)]).amin(0)
+    """(..., 36) the least of a table over azimuth bins within `VIEW_OFF` bins of each: a network misjudges the length
+    or the width of one body by the same angle in every frame, and no number of frames outweighs that."""
+    return torch.stack([table.roll(n, -1) for n in range(-VIEW_OFF, VIEW_OFF + 1)]).amin(0)
 
 
 def at_azimuth(table: Tensor, azimuth: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """What an animal does on the spot: how trunk, head and paws leave where they are while it stands.
 
-Lengths are heights of the withers (`Proportions`), angles rad. Every act begins and ends with a standing animal.
+Lengths are heights of the withers (`Proportions`), angles rad. Every act begins with a standing animal, and comes back
+to it if there is time.
 """
 
 from collections.abc import Callable
@@ -75,8 +76,8 @@ def _down(p: Proportions, t: Array, rng: np.random.Generator, *, rise: float, fr
     a.look[:] = 0.8 * pitch * w
     first = rng.permutation(2)
     thigh, shank, foot = (
-        float(np.linalg.norm(rest[f"hind_left_{a}"] - rest[f"hind_left_{b}"]))
-        for a, b in (("hip", "knee"), ("knee", "hock"), ("hock", "paw"))
+        float(np.linalg.norm(rest[f"hind_left_{upper}"] - rest[f"hind_left_{lower}"]))
+        for upper, lower in (("hip", "knee"), ("knee", "hock"), ("hock", "paw"))
     )
     # The hock lies under the hip, or behind it where thigh and shank do not fold as far as that.
     high = _PELVIS + rest["hind_left_hip"][2] - rest["pelvis"][2] - _HOCK
@@ -114,10 +115,8 @@ def _reach(p: Proportions, t: Array, rng: np.random.Generator) -> Act:
 
 def _graze(p: Proportions, t: Array, rng: np.random.Generator) -> Act:
     """The nose to the ground, as far as neck and head are long."""
-    w, a = (
-        _smooth(_there_and_back(t, rng.uniform(0.2, 0.5), rng.uniform(0.7, 1.0), rng.uniform(1, 2), 0.6)),
-        _nothing(t),
-    )
+    w = _smooth(_there_and_back(t, rng.uniform(0.2, 0.5), rng.uniform(0.7, 1.0), rng.uniform(1, 2), 0.6))
+    a = _nothing(t)
     a.pitch[:] = 0.10 * w
     look = np.linspace(0, 1.9, 96)
     rest = rest_joints(p)
