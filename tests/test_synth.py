@@ -69,13 +69,16 @@ def test_acts_are_what_they_are_called_and_begin_and_end_standing(animal, act):
     assert min(z.min() for z in high.values()) > 0
 
 
-def test_a_gallop_flies_and_lands_its_hind_feet_first():
-    m = animate(proportions("dog", 0), "gallop", np.arange(400) / 200, speed=None, turn=0.0, seed=0)
+# Hind left, hind right, and then the front feet: on the same lead, or on the other one.
+@pytest.mark.parametrize(
+    ("gait", "follows"), [("gallop", {2: 3, 3: 0, 0: 1, 1: 2}), ("rotary", {2: 3, 3: 1, 1: 0, 0: 2})]
+)
+def test_a_gallop_flies_and_lands_its_hind_feet_first(gait, follows):
+    m = animate(proportions("dog", 0), gait, np.arange(400) / 200, speed=None, turn=0.0, seed=0)
     assert 0.05 < (m.contact.sum(1) == 0).mean() < 0.6
     touch = [(int(k), i) for i in range(4) for k in np.flatnonzero(np.diff(m.contact[:, i].astype(int)) == 1)]
     order = [i for _, i in sorted(touch)]
     assert len(order) > 8
-    follows = {2: 3, 3: 0, 0: 1, 1: 2}  # hind left, hind right, front left, front right
     assert all(b == follows[a] for a, b in pairwise(order))
 
 
@@ -128,7 +131,7 @@ def test_who_is_on_the_spot_does_not_travel():
         truth(Config(animal="person", gait="squat", speed=1.0))
     with pytest.raises(UsageError, match="on the spot"):
         truth(Config(gait="sit", turn=10.0))
-    with pytest.raises(UsageError, match="valid: walk, pace, trot, gallop, stand, reach, graze"):
+    with pytest.raises(UsageError, match="valid: walk, pace, trot, gallop, rotary, stand, reach, graze"):
         Config(animal="horse", gait="sit")
     with pytest.raises(UsageError, match="valid: walk, run"):
         Config(animal="person", gait="trot")

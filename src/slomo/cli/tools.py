@@ -105,7 +105,7 @@ def add_commands(app: typer.Typer) -> None:
             str | None,
             typer.Option(
                 metavar="NAME",
-                help="walk, pace, trot, gallop, stand, reach, graze, sit, lie; "
+                help="walk, pace, trot, gallop, rotary, stand, reach, graze, sit, lie; "
                 "of a person walk, run, stand, squat, jack, wave. Default: walk.",
             ),
         ] = None,

@@ -85,6 +85,11 @@ def estimate_camera(
             report["focal_observed"] = settings.refine_focal
             std = certainty.focal_std(structure, center) if settings.refine_focal else settings.focal_std
             path = moving(frames, masks, structure, std, center, report)
+            for at in path.report["scale_breaks"]:
+                progress.note(
+                    f"camera: the path broke at {t[at['after_frame']]:.1f} s into parts of unlike scale (times "
+                    f"{at['times']:.2g}), and was mended by the height over the ground"
+                )
             if (guessed := len(frames) - path.report["frames_measured"]) > _MOST_GUESSED * len(frames):
                 path.report["fallback"] = f"the camera of {guessed} of {len(frames)} frames is interpolated"
                 progress.note(f"camera: {path.report['fallback']}: structure from motion does not reach them")

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slomo.reconstruct import ground, resection, sfm
+from slomo.reconstruct import ground, resection, scale_breaks, sfm
 
 GROUND_SUPPORT = 0.08  # part of the weight of all sparse points that a plane needs to be taken for the ground
 SLOPE_DEG = 1.0  # standard deviation of the slope of what subjects walk on
@@ -72,9 +72,11 @@ def moving(
 ) -> CameraPath:
     """A camera that travels: the frames between the key frames, the ground, and the scale that it sets."""
     K = _intrinsics(structure.focal, center)
+    weights = _near_feet(structure, masks)
+    structure, breaks = scale_breaks.mended(structure, weights)
     path, measured = resection.camera_path(frames, structure, K)
     axes = Rotation.from_matrix(path[:, :3, :3]).mean().as_matrix()
-    plane = ground.find_ground(structure.points, _near_feet(structure, masks), axes, path[:, :3, 3])
+    plane = ground.find_ground(structure.points, weights, axes, path[:, :3, 3])
     if plane is not None and plane.support > GROUND_SUPPORT:
         up, offset = plane.normal, plane.offset
         report |= {
@@ -103,6 +105,7 @@ def moving(
         "frames_measured": int(measured.sum()),
         "sparse_points": len(structure.points),
         "least_angle_deg": structure.least_angle,
+        "scale_breaks": [{"after_frame": frame, "times": round(ratio, 3)} for frame, ratio in breaks],
         "scale_source": "mean camera height over the ground set to 1",
     }
     return CameraPath(K, T, report)

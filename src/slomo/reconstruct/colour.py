@@ -17,12 +17,11 @@ class ColourModel:
     log_ratio: np.ndarray
 
     @classmethod
-    def learn(cls, lab: np.ndarray, subject: np.ndarray, surroundings: np.ndarray) -> "ColourModel":
-        """From Lab pixels (P, 3) uint8 with their weights (P,) as subject and as surroundings."""
-        index = np.ravel_multi_index(tuple((lab.astype(int) * _BINS // 256).T), (_BINS,) * 3)
+    def learn(cls, subject: np.ndarray, surroundings: np.ndarray) -> "ColourModel":
+        """From how many pixels of each colour are the subject's and the surroundings' (`count_colours`)."""
         density = []
-        for weight in (subject, surroundings):
-            counts = np.bincount(index, weight, _BINS**3).reshape((_BINS,) * 3)
+        for counts in (subject, surroundings):
+            counts = counts.reshape((_BINS,) * 3)
             for axis in range(3):
                 counts = _blur(counts, axis)
             density.append(counts / max(counts.sum(), 1e-9) + 1e-6)
@@ -31,6 +30,12 @@ class ColourModel:
     def __call__(self, lab: np.ndarray) -> np.ndarray:
         """Log ratio (H, W) of a Lab picture (H, W, 3) uint8."""
         return self.log_ratio[tuple(np.moveaxis(lab.astype(int) * _BINS // 256, -1, 0))]
+
+
+def count_colours(lab: np.ndarray) -> np.ndarray:
+    """(24^3,) how many of the Lab pixels (P, 3) uint8 fall into each cell of the grid of colours."""
+    cells = tuple((lab.astype(np.int32) * _BINS // 256).T)
+    return np.bincount(np.ravel_multi_index(cells, (_BINS,) * 3), minlength=_BINS**3).astype(float)
 
 
 def _blur(x: np.ndarray, axis: int) -> np.ndarray:
@@ -47,16 +52,14 @@ def to_lab(frame: np.ndarray) -> np.ndarray:
 
 def learn_colours(frames: np.ndarray, body: dict[int, np.ndarray], *, reach: float = 0.5) -> ColourModel:
     """Colours inside the silhouettes against those around them up to `reach` roots of their area, over the clip."""
-    lab, inside, outside = [], [], []
+    counts = np.zeros((2, _BINS**3))
     for k, mask in body.items():
         near = grown(mask, reach)
         core = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         ring = near & ~grown(mask, 0.03)
-        take = (core | ring)[::2, ::2]
-        lab.append(to_lab(frames[k])[::2, ::2][take])
-        inside.append(core[::2, ::2][take])
-        outside.append(ring[::2, ::2][take])
-    return ColourModel.learn(*(np.concatenate(x) for x in (lab, inside, outside)))
+        lab = to_lab(frames[k])[::2, ::2]
+        counts += [count_colours(lab[where[::2, ::2]]) for where in (core, ring)]
+    return ColourModel.learn(*counts)
 
 
 def cut(frame: np.ndarray, probability: np.ndarray, *, iterations: int = 2, margin: float = 0.15) -> np.ndarray:

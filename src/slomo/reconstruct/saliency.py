@@ -51,8 +51,7 @@ class SaliencySegmenter:
         track.start(seed, *seen)
         for order in (keys[keys.index(seed) :], keys[: keys.index(seed) + 1][::-1]):
             track.follow(order, lambda: progress(0.2 + 0.5 * len(track.layers) / len(keys)))
-        layers = track.layers
-        told = track.settle_who_is_who()
+        layers, told = track.layers, track.settle_who_is_who()
         repaired = give_back_surroundings(frames, layers)
         patched = give_back_patches(frames, layers, flow)
         progress(0.8)
@@ -267,7 +266,7 @@ class _Track:
         keys = sorted(self._who)
         if not any((self._who[k] < 0).any() for k in keys):
             return 0
-        total = {k: self._who[k].astype(np.float32) / 20 for k in keys}
+        total = {k: self._who[k].copy() for k in keys}  # twentieths, too: 6 of one order do not outgrow 127
         for order in (keys, keys[::-1]):
             carried = np.zeros_like(total[keys[0]])
             for previous, k in zip([order[0], *order], order, strict=False):
@@ -275,12 +274,13 @@ class _Track:
                     before = carried + self._who[previous].astype(np.float32) / 20
                     fades = _MEMORY ** abs(k - previous)
                     carried = fades * np.clip(sample(before, self.flow.chain(k, previous)), -6, 6)
-                total[k] += carried
+                total[k] = np.clip(total[k] + np.round(20 * carried), -127, 127).astype(np.int8)
         changed = 0
         for k in keys:
             foreign = (total[k] < 0) & (self.layers[k] > 0.5)
             changed += bool(foreign.sum() > 0.01 * max((self.layers[k] > 0.5).sum(), 1))
             self.layers[k] = np.where(total[k] < 0, 0, self.layers[k]).astype(np.float16)
+        self._who = {}  # a third as large as the frames, and settled
         return changed
 
 

@@ -3,6 +3,7 @@
 Inputs by name: files "clip" (decode), "weights" and "masks" (masks); artifacts "decode", "masks".
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,8 +14,8 @@ from slomo.reconstruct.video import decode
 from slomo.stage import Artifact, Inputs, Progress
 
 DECODE_VERSION = 2
-MASKS_VERSION = 14
-CAMERA_VERSION = 7
+MASKS_VERSION = 15
+CAMERA_VERSION = 8
 QUALITIES = ("draft", "normal", "high")
 
 SEGMENTERS = ("auto", "u2netp", "still", "motion", "user")
@@ -243,10 +244,10 @@ def _segmented(segmenter, config: MasksConfig, choice, frames: np.ndarray, flow,
     report = lambda f: progress.update(0.25 + 0.7 * f, f"masks ({segmenter.name})")  # noqa: E731
     if config.segmenter != "auto" or segmenter.name == "user" or not stands_still(flow):
         return segmenter, segmenter.segment(frames, flow, report)
-    still = StillSegmenter(choice)
-    try:
+    still, other = StillSegmenter(choice), None
+    with suppress(InvalidData):
         other = still.segment(frames, flow, lambda f: progress.update(0.25 + 0.1 * f, "masks (still)"))
-    except InvalidData:
+    if other is None:  # not where it is caught: the error holds arrays as large as the frames
         return segmenter, segmenter.segment(frames, flow, report)
     if segmenter.name == "motion":
         return still, other

@@ -40,7 +40,7 @@ _SURELY = 2.0  # log odds, of what belongs to the subject though nothing joins i
 
 def stands_still(flow: Flow) -> bool:
     """Whether most of the picture does not move, neither from frame to frame nor in all."""
-    step = np.median(flow.forward.astype(np.float32), axis=(1, 2))
+    step = np.array([np.median(field.astype(np.float32), axis=(0, 1)) for field in flow.forward])
     course = np.concatenate([np.zeros((1, 2), np.float32), np.cumsum(step, 0)])
     return bool(np.quantile(np.abs(step), 0.9) < _STILL_PX and np.ptp(course, axis=0).max() < _DRIFT_PX)
 
@@ -68,15 +68,17 @@ class StillSegmenter:
         for turn in range(self.rounds):
             median, spread = _background(frames, covered, sampled)
             darkest = _darkest_shade(frames, body, median, spread) if body else SHADOW[0]
-            differs = {t: _differs(frames[t], median, spread, darkest) for t in range(T)}
             if not body:
-                body = follow({t: _pieces(d) for t, d in differs.items()}, flow, self.choice)
+                pieces = {t: _pieces(_differs(frames[t], median, spread, darkest)) for t in range(T)}
+                body = follow(pieces, flow, self.choice)
             seen = {t: b for t, b in body.items() if b.mean() > 0.3 * _LEAST}
             if len(seen) < 0.3 * T or np.median([b.mean() for b in seen.values()]) < _LEAST:
                 raise no_subject("nothing large enough differs from the background of a camera that stands still")
             model = learn_colours(frames, {t: seen[t] for t in list(seen)[:: max(1, len(seen) // 40)]})
             for t in range(T):
-                body[t] = _refined(frames[t], differs[t], body[t], model)
+                if body[t].any():
+                    differs = _differs(frames[t], median, spread, darkest)
+                    body[t] = _refined(frames[t], differs, body[t], model)
                 covered[t] = grown(body[t], 0.1) if body[t].any() else body[t]
                 progress((turn + (t + 1) / T) / (self.rounds + 0.2))
         shown = [t for t in range(T) if body[t].any()]
@@ -173,8 +175,6 @@ def _pieces(differs: np.ndarray) -> np.ndarray:
 
 def _refined(frame: np.ndarray, differs: np.ndarray, body: np.ndarray, model) -> np.ndarray:
     """Silhouette (H, W) bool near where it was, from the difference and the colours."""
-    if not body.any():
-        return body
     near = grown(body, 0.3)
     colour = cv2.GaussianBlur(model(to_lab(frame)), (0, 0), 0.8)
     logit = 1.5 * differs + 0.5 * np.clip(colour, -2.5, 2.5) - 0.3

@@ -35,6 +35,7 @@ GAITS = {
     "pace": Gait((0.08, 0.58, 0.0, 0.5), 0.58, 0.14, 0.31),
     "trot": Gait((0.5, 0.0, 0.0, 0.5), 0.52, 0.27, 0.39),
     "gallop": Gait((0.45, 0.60, 0.0, 0.12), 0.30, 1.8, 0.62, 0.12, 0.12),  # transverse, on the right lead
+    "rotary": Gait((0.60, 0.45, 0.0, 0.12), 0.30, 1.8, 0.62, 0.12, 0.12),  # a gallop whose front and hind leads differ
     "stand": Gait((0.0, 0.0, 0.0, 0.0), 1.0, 0.0, 0.2),
 }
 MOVES = (*GAITS, *ACTS)
