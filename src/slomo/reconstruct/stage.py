@@ -33,7 +33,7 @@ class DecodeConfig:
         duration: s; 0 takes everything to the end.
         fps: frames per second at most; a slower clip keeps its own rate.
         max_side: px, the longer side of the decoded frames at most.
-        megapixels: million pixels of all frames together, the bound on memory (about 7 bytes each): a longer clip is
+        megapixels: million pixels of all frames together, the bound on memory (about 10 bytes each): a longer clip is
             taken at a half or less of its rate, then smaller, and what is still too much is left out, which is said.
     """
 
@@ -41,7 +41,7 @@ class DecodeConfig:
     duration: float = 0.0
     fps: float = 30.0
     max_side: int = 640
-    megapixels: float = 300.0
+    megapixels: float = 280.0
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ def decode(
     duration: float = 0.0,
     fps: float = 30.0,
     max_side: int = 640,
-    megapixels: float = 300.0,
+    megapixels: float = 280.0,
     progress=lambda fraction: None,
 ) -> Clip:
     """Decode `path`, resampling to at most `fps` by the nearest source frame and shrinking to `max_side` px.
