@@ -16,7 +16,7 @@ from slomo.reconstruct.sfm import Structure
 
 Array = np.ndarray
 
-LEAST = 1.6  # times the height from one key frame to the next, from which on it is another scale
+_LEAST = 1.6  # times the height from one key frame to the next, from which on it is another scale
 _NEAR = 5  # key frames either side of a break that say what height and speed are there
 _LAYER = 0.1  # of the height: points within so much of it lie on one ground
 _GROUND = 0.5  # part of the points below a camera that must do so, to tell its height
@@ -79,7 +79,7 @@ def _ratio(height: Array, step: Array, n: int) -> float | None:
         return None
     before, after = np.log(height[max(0, n + 1 - _NEAR) : n + 1]), np.log(height[n + 1 : n + 1 + _NEAR])
     rise = float(after[0] - before[-1])
-    if not abs(rise) > np.log(LEAST):  # NaN is not, either
+    if not abs(rise) > np.log(_LEAST):  # NaN is not, either
         return None
     steady = max(float(np.nanmax(side) - np.nanmin(side)) for side in (before, after))
     slow, fast = (float(np.median(side)) for side in (step[max(0, n - _NEAR) : n], step[n + 1 : n + 1 + _NEAR]))
