@@ -144,4 +144,6 @@ def test_every_gait_is_tried_though_all_phases_of_another_rank_before_it():
     assert [e.loss for e in chosen[:3]] == [0.0, 1.0, 2.0]
     assert len(chosen) == 6
     assert any(e.gait == GaitHypothesis("gallop", 2.0, 6 / 12) for e in chosen)  # the best one's opposite
-    assert [e.gait.name for e in diverse(entries, 2)] == ["gallop", "gallop"]  # and that before another gait
+    assert any(e.gait == GaitHypothesis("gallop", 2.0, 1 / 12) for e in chosen)  # and the phase next to its own
+    assert [e.gait.phase for e in diverse(entries, 2)] == [0.0, 6 / 12]  # the opposite before another gait
+    assert [e.gait.phase for e in diverse(entries, 1)] == [0.0]

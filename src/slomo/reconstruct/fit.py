@@ -184,12 +184,14 @@ def _steps(problem: Problem, root: RootGuess) -> Steps:
 
 def _to_rivals(problem: Problem, run: Run, losses: Tensor, root: RootGuess, *_) -> Run:
     """The two best go on; the best of another gait than the best one's, because a motion without a gait falls faster
-    at first and less far; the best one with its left and right legs exchanged (of a person who stays in place, turned
-    around), because silhouettes hardly tell the two apart and none of the others need be its opposite; and the best
-    one with limbs that are elsewhere for a while, where they would be seen better there."""
+    at first and less far; the one whose phase is next to the best gait's; the best one with its left and right legs
+    exchanged (of a person who stays in place, turned around), because silhouettes hardly tell the two apart and none of
+    the others need be its opposite; and the best one with limbs that are elsewhere for a while, where they would be
+    seen better there."""
     order = losses.argsort().tolist()
     other = [k for k in order if run.labels[k]["gait"] != run.labels[order[0]]["gait"]]
-    which = torch.tensor(list(dict.fromkeys(order[:2] + other[:1])))
+    strides = [k for k in order if "phase" in run.labels[k]]
+    which = torch.tensor(list(dict.fromkeys(order[:2] + other[:1] + _next(run.labels, strides))))
     best = which[:1]
     x, guess = pick(run.x, which), run.guess.pick(which)
     kind, own = problem.kin.skeleton.kind, (problem, pick(run.x, best), run.guess.pick(best))
@@ -203,6 +205,18 @@ def _to_rivals(problem: Problem, run: Run, losses: Tensor, root: RootGuess, *_) 
     labels = [run.labels[int(k)] for k in which]
     labels += [labels[0] | {key: value} for key, value in more]
     return Run(2, x, join([guess, *(g for _, g in more.values())]), labels, run.log)
+
+
+def _next(labels: list[dict], strides: list[int]) -> list[int]:
+    """Of the hypotheses `strides`, best first, which have a gait: the one that is the first but for a phase next to
+    its own, if there is one."""
+
+    def beside(k: int) -> bool:
+        own, best = labels[k], labels[strides[0]]
+        same = all(own[key] == best[key] for key in ("heading", "gait", "stride_hz"))
+        return same and gaits.turn(own["phase"], best["phase"]) < gaits.NEXT
+
+    return [k for k in strides[1:] if beside(k)][:1]
 
 
 def _to_final(problem: Problem, run: Run, losses: Tensor, root: RootGuess, *_) -> Run:

@@ -16,6 +16,7 @@ Array = np.ndarray
 
 AT_ONCE = 24  # gaits
 SHORTLIST = 48  # of them that are ranked once more
+NEXT = 1.5 / 12  # turns between a phase and those next to it, at most
 
 
 @dataclass(frozen=True)
@@ -81,11 +82,11 @@ def ranked(problem: Problem, x: Variables, entries: list[Laid]) -> list[Laid]:
 def diverse(entries: list[Laid], count: int) -> list[Laid]:
     """The best entry of every gait, for what is laid over the body as it is may rank a wrong gait first in all its
     phases; then the best that differ in phase by a sixth, in frequency by a fifth, or in heading; and the best one's
-    left-right opposite, so that a swap of the legs is always weighed against it."""
+    left-right opposite, so that a swap of the legs is always weighed against it, and the one whose phase is next to
+    the best one's: laid over the clip the two are alike, and what is fitted from them is not."""
 
     def far(a: GaitHypothesis, b: GaitHypothesis) -> bool:
-        turn = abs((a.phase - b.phase + 0.5) % 1.0 - 0.5)
-        return a.name != b.name or turn > 1 / 6.5 or abs(math.log(a.frequency / b.frequency)) > 0.15
+        return a.name != b.name or turn(a.phase, b.phase) > 1 / 6.5 or abs(math.log(a.frequency / b.frequency)) > 0.15
 
     firsts = {e.gait.name: e for e in reversed(entries)}
     out = sorted(firsts.values(), key=lambda e: e.loss)[:count]
@@ -94,13 +95,21 @@ def diverse(entries: list[Laid], count: int) -> list[Laid]:
             break
         if all(e.heading != o.heading or far(e.gait, o.gait) for o in out):
             out.append(e)
-    if out:
-        best = out[0]
-        opposite = [
-            e for e in entries
-            if e.heading == best.heading and e.gait.name == best.gait.name and e.gait.frequency == best.gait.frequency
-            and abs(abs(e.gait.phase - best.gait.phase) - 0.5) < 1e-6
-        ]  # fmt: skip
-        if opposite and all(o is not opposite[0] for o in out):
-            out[-1 if len(out) == count else len(out) :] = opposite
-    return out
+    if not out:
+        return out
+    best = out[0]
+    others = [
+        (turn(e.gait.phase, best.gait.phase), e) for e in entries
+        if e.heading == best.heading and e.gait.name == best.gait.name and e.gait.frequency == best.gait.frequency
+    ]  # fmt: skip
+    near = [e for away, e in others if 1e-6 < away < NEXT]
+    opposite = [e for away, e in others if abs(away - 0.5) < 1e-6]
+    more = [found[0] for found in (near, opposite) if found]
+    more = more[max(0, len(more) - count + 1) :]
+    rest = [e for e in out if all(e is not m for m in more)]
+    return rest[: count - len(more)] + more
+
+
+def turn(a: float, b: float) -> float:
+    """By how much two phases of a stride differ, in turns: 0 to 0.5."""
+    return abs((a - b + 0.5) % 1.0 - 0.5)
