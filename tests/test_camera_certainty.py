@@ -9,7 +9,7 @@ import pytest
 import safetensors.numpy
 from scipy.spatial.transform import Rotation
 
-from slomo.reconstruct import certainty, resection, sfm
+from slomo.reconstruct import certainty, resection, scale_breaks, sfm
 from slomo.reconstruct.camera import _key_frames, estimate_camera
 from slomo.reconstruct.tracks import Tracks
 from slomo.stage import Silent
@@ -196,6 +196,24 @@ def test_frames_that_structure_from_motion_does_not_reach_are_named(monkeypatch)
     monkeypatch.setattr(resection, "camera_path", lambda *a: (path, np.arange(45) < 40))
     found = estimate_camera(frames, np.zeros(frames.shape[:3], bool), np.arange(45) / 30, settings(300.0), Silent())
     assert found.report["fallback"] == "the camera of 5 of 45 frames is interpolated"
+
+
+def test_a_break_in_the_scale_that_was_mended_is_said(monkeypatch):
+    said: list[str] = []
+
+    class Notes(Silent):
+        def note(self, message):
+            said.append(message)
+
+    frames = layers(45)
+    keys = np.array([*range(0, 45, 3), 44])
+    s = structure(0.3, cameras=len(keys))
+    made = sfm.Structure(keys, s.T_world_cam, 300.0, s.points, s.observations, s.xy, 0.3, 1.5)
+    monkeypatch.setattr(sfm, "reconstruct_structure", lambda *a, **k: made)
+    monkeypatch.setattr(scale_breaks, "mended", lambda structure, weights: (structure, [(15, 14.288)]))
+    path = estimate_camera(frames, np.zeros(frames.shape[:3], bool), np.arange(45) / 30, settings(300.0), Notes())
+    assert path.report["scale_breaks"] == [{"after_frame": 15, "times": 14.288}]
+    assert any("broke at 0.5 s" in message and "times 14)" in message for message in said)
 
 
 def test_featureless_background_is_said():

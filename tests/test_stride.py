@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from slomo.pinhole import Intrinsics
-from slomo.reconstruct import gaits
+from slomo.reconstruct import fit, gaits
 from slomo.reconstruct.gaits import SHORTLIST, Laid, diverse, ranked
 from slomo.reconstruct.hypotheses import GRAVITY, GaitHypothesis, gait_grid, gait_pose
 from slomo.reconstruct.kinematics import Kinematics
@@ -147,3 +147,21 @@ def test_every_gait_is_tried_though_all_phases_of_another_rank_before_it():
     assert any(e.gait == GaitHypothesis("gallop", 2.0, 1 / 12) for e in chosen)  # and the phase next to its own
     assert [e.gait.phase for e in diverse(entries, 2)] == [0.0, 6 / 12]  # the opposite before another gait
     assert [e.gait.phase for e in diverse(entries, 1)] == [0.0]
+
+
+def test_the_phase_next_to_the_best_gait_goes_on_with_it():
+    """Of the same heading, gait and frequency, across the end of the stride, too; and not what is merely better."""
+    best = {"heading": "travel+0", "gait": "gallop", "stride_hz": 1.7, "phase": 0.0}
+    labels = [
+        {"heading": "travel+0", "gait": "none"},
+        best,
+        best | {"phase": 0.5},
+        best | {"phase": 0.083, "stride_hz": 1.8},
+        best | {"phase": 0.083, "gait": "trot"},
+        best | {"phase": 0.083, "heading": "travel+30"},
+        best | {"phase": 0.917},
+        best | {"phase": 0.083},
+    ]
+    assert fit._next(labels, [1, 2, 3, 4, 5, 6, 7]) == [6]
+    assert fit._next(labels, [1, 2, 3, 4, 5]) == []
+    assert fit._next(labels, []) == []
