@@ -130,9 +130,6 @@ def _near_feet(structure: sfm.Structure, masks: np.ndarray) -> np.ndarray:
 def _parallax(structure: sfm.Structure) -> np.ndarray:
     """(P,) rad, angle between the rays to each point from the first and the last frame that see it."""
     centers = structure.T_world_cam[:, :3, 3]
-    first, last = np.full(len(structure.points), len(centers) - 1), np.zeros(len(structure.points), int)
-    np.minimum.at(first, structure.observations[:, 1], structure.observations[:, 0])
-    np.maximum.at(last, structure.observations[:, 1], structure.observations[:, 0])
-    a, b = (centers[n] - structure.points for n in (first, last))
+    a, b = (centers[n] - structure.points for n in structure.seen())
     cosine = (a * b).sum(-1) / np.maximum(np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1), 1e-12)
     return np.arccos(np.clip(cosine, -1.0, 1.0))

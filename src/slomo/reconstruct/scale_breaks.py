@@ -37,8 +37,7 @@ def mended(structure: Structure, weights: Array) -> tuple[Structure, list[tuple[
         return structure, []
     height, step = _heights(structure, plane.normal), np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=-1)
     centers, points, found = T[:, :3, 3].copy(), structure.points.copy(), []
-    first = np.full(len(points), len(T))
-    np.minimum.at(first, structure.observations[:, 1], structure.observations[:, 0])
+    first, _ = structure.seen()
     for n in range(len(T) - 1):
         if (ratio := _ratio(height, step, n)) is not None:
             last = _last(step, n, ratio)

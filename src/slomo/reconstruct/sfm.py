@@ -59,6 +59,14 @@ class Structure:
         """What `of` makes it from."""
         return {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
 
+    def seen(self) -> tuple[np.ndarray, np.ndarray]:
+        """(P,) each: the places in `frames` of the first and the last frame that sees each point."""
+        frame, point = self.observations.T
+        first, last = np.full(len(self.points), len(self.frames) - 1), np.zeros(len(self.points), int)
+        np.minimum.at(first, point, frame)
+        np.maximum.at(last, point, frame)
+        return first, last
+
 
 def reconstruct_structure(
     frames: np.ndarray,
