@@ -42,7 +42,7 @@ class CameraConfig:
 
 @dataclasses.dataclass(frozen=True)
 class FitConfig:
-    skeleton: str = "quadruped"
+    skeleton: str = "auto"
     length_m: float = 0.5
     iterations: int = 20
     seed: int = 0
@@ -62,7 +62,7 @@ class ReconstructConfig(FitConfig):
 @dataclasses.dataclass(frozen=True)
 class EvidenceConfig:
     prior: str = "auto"
-    skeleton: str = "quadruped"
+    skeleton: str = "auto"
     fps: float = 15.0
 
 

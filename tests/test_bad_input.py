@@ -164,7 +164,7 @@ def test_names_that_do_not_exist(slomo, tmp_path):
     said = slomo(tmp_path, "reconstruct", CLIP, code=2)
     assert "[camera]: no parameter 'fov' (valid: fov_deg, " in said
     said = slomo(tmp_path / "b", "reconstruct", CLIP, "--skeleton", "spider", code=2)
-    assert "no skeleton 'spider' (valid: quadruped, human)" in said
+    assert "no skeleton 'spider' (valid: auto, quadruped, human)" in said
 
 
 def test_a_project_below_a_file(slomo, tmp_path):

@@ -47,7 +47,8 @@ def test_a_cut_is_the_clip_of_those_frames(walk):
         frame=np.arange(0, T, 2), view=np.tile(np.eye(36)[5], (T // 2, 1)), keypoint_names=np.array(["nose"]),
         keypoints=np.arange(T)[::2, None, None] * np.ones((1, 1, 2)), keypoint_side=np.ones(1),
     )  # fmt: skip
-    whole = Inputs(artifacts={**walk.artifacts, "evidence": Artifact(npz={"evidence.npz": said})})
+    about = {"report.json": {"skeleton": "quadruped"}}
+    whole = Inputs(artifacts={**walk.artifacts, "evidence": Artifact(npz={"evidence.npz": said}, json=about)})
     part = chunks.cut(whole, 6, 18)
     obs = prepare(part, CONFIG).problem.obs
     assert len(obs.t) == 12

@@ -148,7 +148,7 @@ def test_the_prior_of_the_skeleton_s_kind_is_an_input(tmp_path, monkeypatch):
     (tmp_path / settings.FILE).write_text(text + '[reconstruct]\nskeleton = "human"\nfps = 12.0\n')
     project = Project(tmp_path)
     assert project.files("evidence")["prior"] == tmp_path / "own.onnx"
-    assert asked == ["quadruped", "human"]
+    assert asked == ["auto", "human"]
     assert (project.config("evidence").skeleton, project.config("evidence").fps) == ("human", 12.0)
     (tmp_path / settings.FILE).write_text(text + 'prior = "mine.onnx"\n[evidence]\nfps = 5.0\n')
     assert Project(tmp_path).files("evidence")["prior"] == tmp_path / "mine.onnx"

@@ -139,11 +139,12 @@ def _find_weights() -> Path | None:
 
 
 def _find_prior(skeleton: str | Path) -> Path | None:
-    """The weights that come with slomo for the kind of this skeleton. Raises `UsageError`, `InvalidData`."""
-    from slomo.prior.inference import packaged
-    from slomo.skeleton import load_skeleton
+    """The weights that come with slomo for the kind of this skeleton, all of them where the clip is to tell it. Raises
+    `UsageError`, `InvalidData`."""
+    from slomo.prior.inference import packaged, packaged_folder
+    from slomo.skeleton import AUTO, load_skeleton
 
-    return packaged(load_skeleton(skeleton).kind)
+    return packaged_folder() if skeleton == AUTO else packaged(load_skeleton(skeleton).kind)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,8 @@ from slomo.errors import InvalidData, UsageError
 
 Array = np.ndarray
 
+AUTO, USUAL = "auto", "quadruped"  # stands for the skeleton that the clip shows; the one where nothing tells
+
 
 @dataclass(frozen=True)
 class Limb:

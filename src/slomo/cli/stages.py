@@ -10,7 +10,8 @@ from slomo.cli.subject import AtOption, BoxOption, chosen_subject
 from slomo.errors import UsageError
 
 SkeletonOption = Annotated[
-    str | None, typer.Option("--skeleton", metavar="quadruped|human|PATH", help="Whose bones to fit.")
+    str | None,
+    typer.Option("--skeleton", metavar="auto|quadruped|human|PATH", help="Whose bones to fit; auto: the clip tells."),
 ]
 SegmenterOption = Annotated[
     str | None, typer.Option("--segmenter", metavar="auto|u2netp|still|motion|user", help="How the subject is found.")
@@ -48,7 +49,7 @@ SolverOption = Annotated[
     str | None, typer.Option("--solver", metavar="ddp|fatrop|ipopt", help="How it is solved, see docs/solvers.md.")
 ]
 KEYPOINT_SUFFIXES = (".json", ".npz")
-BUILT_IN_SKELETONS = ("quadruped", "human")
+BUILT_IN_SKELETONS = ("auto", "quadruped", "human")
 
 
 def _given(**values: Any) -> dict[str, Any]:

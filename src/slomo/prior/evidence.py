@@ -45,6 +45,12 @@ class Shots:
     motion: Motion
     travel: Array
 
+    def crop(self, f: int, size: int) -> Array:
+        """(6, size, size) float32: what a network is shown of the f-th frame."""
+        frame = int(self.index[f])
+        motion = self.motion.at(frame)
+        return network_input(self.frames[frame], self.masks[frame], motion, Box(*self.box[f]), size)
+
     def carried(self, places: Array) -> Array:
         """(F-1, ..., 2) px: places (F, ..., 2) px of each frame, carried to the next."""
         out = np.empty((len(places) - 1, *places.shape[1:]))
@@ -84,9 +90,8 @@ def from_network(
 ) -> tuple[Columns, Dense, dict[str, Any]]:
     """Everything that slomo's network says, with the view and the sides of the clip; and a report."""
     crops = np.empty((len(shots.index), 6, prior.size, prior.size), np.float32)
-    for f, frame in enumerate(shots.index):
-        box = Box(*shots.box[f])
-        crops[f] = network_input(shots.frames[frame], shots.masks[frame], shots.motion.at(int(frame)), box, prior.size)
+    for f in range(len(crops)):
+        crops[f] = shots.crop(f, prior.size)
         say(0.3 * f / len(crops))
     seen = prior(crops)
     say(0.8)

@@ -47,9 +47,14 @@ class Prediction:
     up: Array
 
 
+def packaged_folder() -> Path:
+    """Where the weights are that come with slomo."""
+    return Path(str(resources.files("slomo"))) / "prior" / "weights"
+
+
 def packaged(kind: str) -> Path | None:
     """The weights that come with slomo for a kind of skeleton, if there are any."""
-    path = Path(str(resources.files("slomo"))) / "prior" / "weights" / f"{kind}.onnx"
+    path = packaged_folder() / f"{kind}.onnx"
     return path if path.is_file() else None
 
 

@@ -1,6 +1,6 @@
 """Evidence as a stage: what networks, models and the user say about the frames of a clip, for the fit to weigh."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,15 +13,16 @@ from slomo.prior.evidence import GRID, Columns, Dense, Shots, from_model, from_n
 from slomo.prior.external import ExternalModel, load_map
 from slomo.prior.frames import Motion, every
 from slomo.prior.inference import Prior, packaged
+from slomo.prior.kind import kind_of
 from slomo.prior.labels import BINS, Labels, labels
 from slomo.prior.travel import view_of_travel
 from slomo.prior.user_keypoints import load_user_keypoints, to_decoded
-from slomo.skeleton import load_skeleton
-from slomo.stage import Arrays, Artifact, Inputs, Progress
+from slomo.skeleton import AUTO, USUAL, Skeleton, list_skeletons, load_skeleton
+from slomo.stage import Artifact, Inputs, Progress
 
 Array = np.ndarray
 
-VERSION = 8
+VERSION = 9
 MOST_FRAMES = 600  # that are looked at: each takes 3 MB, and long clips are not to take more than others
 
 PRIORS = ("auto", "none")
@@ -34,12 +35,13 @@ class Config:
     Attributes:
         prior: "auto" (the file inputs.prior, else the network that comes with slomo for this kind of skeleton, if any)
             or "none".
-        skeleton: that of the fit, [reconstruct] skeleton, unless set here.
+        skeleton: that of the fit, [reconstruct] skeleton, unless set here; "auto": told from the clip by slomo's own
+            networks, or by what inputs.prior was trained for, "quadruped" where neither is asked.
         fps: frames a second at most; that of the fit, [reconstruct] fps, unless set here.
     """
 
     prior: str = "auto"
-    skeleton: str = "quadruped"
+    skeleton: str = "auto"
     fps: float = 30.0
 
     def __post_init__(self):
@@ -70,8 +72,10 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
         InvalidData: a given file cannot be used, or does not fit the skeleton.
         UsageError: unknown skeleton, or a model without its mapping.
     """
-    skeleton = load_skeleton(inputs.files.get("skeleton", config.skeleton))
+    shots = _shots(inputs, config.fps)
+    skeleton, clear = _skeleton(inputs, config, shots, progress)
     known = labels(skeleton)
+    shots = replace(shots, travel=_travel(inputs, shots, known.kind))
     prior = _prior(inputs, config, known, progress)
     files = inputs.files
     if ("keypoint_model" in files) != ("keypoint_map" in files):
@@ -82,8 +86,13 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     if "keypoint_model" in files:
         model = ExternalModel(files["keypoint_model"], load_map(files["keypoint_map"], known.keypoints))
 
-    shots = _shots(inputs, config.fps, known.kind)
-    report: dict[str, Any] = {"skeleton": skeleton.name, "prior": "none", "weights_sha256": None, "sources": {}}
+    report: dict[str, Any] = {
+        "skeleton": skeleton.name,
+        "seen_as": clear,
+        "prior": "none",
+        "weights_sha256": None,
+        "sources": {},
+    }
     columns: dict[str, Columns] = {}
     dense: Dense | None = None
     if prior and len(shots.index):
@@ -114,12 +123,32 @@ def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     return Artifact(npz={"evidence.npz": _arrays(shots, known, columns, dense)}, json={"report.json": report})
 
 
+def _skeleton(inputs: Inputs, config: Config, shots: Shots, progress: Progress) -> tuple[Skeleton, dict[str, float]]:
+    """The user's, or that of what the clip shows, and how clearly it is seen as each kind if that was asked."""
+    named = inputs.files.get("skeleton", config.skeleton)
+    if named != AUTO:
+        return load_skeleton(named), {}
+    prior = inputs.files.get("prior")
+    if config.prior == "none" or prior is None:
+        progress.note(f"evidence: skeleton {USUAL} (nobody is asked; --skeleton human for a person)")
+        return load_skeleton(USUAL), {}
+    if not prior.is_dir():
+        kind = Prior(prior).kind
+        return load_skeleton(kind if kind in list_skeletons() else USUAL), {}
+    kind, clear = kind_of(prior, shots)
+    told = ", ".join(f"{name} {value:.2f}" for name, value in clear.items())
+    progress.note(f"evidence: skeleton {kind} (how clearly key points are seen: {told}; --skeleton takes another)")
+    return load_skeleton(kind), clear
+
+
 def _prior(inputs: Inputs, config: Config, known: Labels, progress: Progress) -> Prior | None:
     """The network to ask, or None, which is said."""
     path = inputs.files.get("prior")
     if config.prior == "none":
         progress.note("evidence: no prior")
         return None
+    if path and path.is_dir():
+        path = path / f"{known.kind}.onnx"
     if path is None:
         progress.note(
             f"evidence: no prior, slomo has none for a skeleton of kind {known.kind!r} (name your own: --prior FILE)"
@@ -139,39 +168,40 @@ def _name(prior: Prior, known: Labels) -> str:
     return f"{known.kind} (packaged)" if prior.path == packaged(known.kind) else f"{known.kind} ({prior.path.name})"
 
 
-def _shots(inputs: Inputs, fps: float, kind: str) -> Shots:
-    """The frames to look at: every n-th, fewer of a long clip, those without a subject left out."""
+def _shots(inputs: Inputs, fps: float) -> Shots:
+    """The frames to look at: every n-th, fewer of a long clip, those without a subject left out. The way of travel
+    says nothing yet."""
     decode, masks = inputs.artifacts["decode"].npz["frames.npz"], inputs.artifacts["masks"].npz
     packed = masks["masks.npz"]
     t = np.asarray(decode["t"], float)
     full = np.unpackbits(packed["packed"], axis=-1)[..., : int(packed["shape"][2])].astype(bool)
     index = np.arange(0, len(t), max(every(t, fps), -(-len(t) // MOST_FRAMES)))
     index = index[full[index].any((1, 2))]
-    camera = inputs.artifacts["camera"].npz["camera.npz"]
-    quality = np.asarray(packed["quality"], float)[index]
     return Shots(
         index=index,
         t=t[index],
         box=np.array([crop_box(full[f]) for f in index], float).reshape(-1, 3),
-        quality=quality,
+        quality=np.asarray(packed["quality"], float)[index],
         frames=decode["frames"],
         masks=full,
         motion=Motion(masks["flow.npz"]["flow"], full, t),
-        travel=_travel(t, index, full[index], quality, camera, kind),
+        travel=np.full((len(index), BINS), 1 / BINS, np.float32),
     )
 
 
-def _travel(t: Array, index: Array, masks: Array, quality: Array, camera: Arrays, kind: str) -> Array:
-    """(F, 36) the view by the subject's path on the ground; masks (F, H, W), none empty."""
+def _travel(inputs: Inputs, shots: Shots, kind: str) -> Array:
+    """(F, 36) the view by the subject's path on the ground."""
+    if len(shots.index) < 3:  # too few for a path
+        return shots.travel
+    camera, t = inputs.artifacts["camera"].npz["camera.npz"], inputs.artifacts["decode"].npz["frames.npz"]["t"]
+    masks = shots.masks[shots.index]
     F, height, width = masks.shape
-    if F < 3:  # too few for a path
-        return np.full((F, BINS), 1 / BINS, np.float32)
-    f = np.asarray(camera["K"], float)
+    f, T_world_cam = (np.asarray(camera[name], float) for name in ("K", "T_world_cam"))
     K = Intrinsics(f[0, 0], f[1, 1], f[0, 2], f[1, 2], width, height)
     box = np.array([mask_box(m) for m in masks], float)
-    T_world_cam = np.asarray(camera["T_world_cam"], float)
-    path = ground_path(t, index, K, T_world_cam, box, quality=quality, empty=np.zeros(F, bool))
-    return view_of_travel(path, t, index, T_world_cam, kind)
+    t = np.asarray(t, float)
+    path = ground_path(t, shots.index, K, T_world_cam, box, quality=shots.quality, empty=np.zeros(F, bool))
+    return view_of_travel(path, t, shots.index, T_world_cam, kind)
 
 
 def _arrays(shots: Shots, known: Labels, columns: dict[str, Columns], dense: Dense | None) -> dict[str, Array]:

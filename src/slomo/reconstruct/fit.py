@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from slomo.reconstruct import alike, gaits, hypotheses, limb_track, pose_track, starts
+from slomo.reconstruct import alike, gaits, hypotheses, limb_track, pose_track, sides, starts
 from slomo.reconstruct.hypotheses import GaitHypothesis, RootGuess
 from slomo.reconstruct.problem import Problem, Schedule, optimise, pick, rank
 from slomo.reconstruct.run import Run, checkpoint, join, restore
@@ -69,7 +69,8 @@ def fit(
             problem, run.x, run.guess, schedule, generator, start=start, adam_state=adam_state, each=each
         )  # fmt: skip
         start, adam_state = 0, None
-        losses = rank(problem, run.x, run.guess, draws=4 if run.phase < FINAL else 24)
+        judge, draws = (problem, 4) if run.phase < FINAL else (sides.doubting(problem), 24)
+        losses = rank(judge, run.x, run.guess, draws=draws)
         run.log[PHASES[run.phase]] = [
             label | {"loss": round(float(v), 4)} for label, v in zip(run.labels, losses, strict=True)
         ]
@@ -255,7 +256,7 @@ def _feet_apart(problem: Problem, run: Run, one: int) -> Tensor:
 
 def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, *_) -> Run:
     """The best one goes on, beside it with limbs that are where they are seen better by now, where any are and there is
-    time for it."""
+    time for it, and with a pair of legs exchanged where that is hardly worse."""
     best = _winner(run, _stepping(run, losses, root))
     rivals = [(best.x, best.guess)]
     labels = list(best.labels)
@@ -272,6 +273,9 @@ def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effor
             if found is not None:
                 rivals.append(found)
                 labels.append(labels[-1] | {"strides": "alike"})
+        for name, x, guess in sides.exchanged_pairs(problem, best.x, best.guess):
+            rivals.append((x, guess))
+            labels.append(labels[0] | {"exchanged": name})
     x = {k: torch.cat([x[k] for x, _ in rivals]) for k in best.x}
     return Run(run.phase + 1, x, join([guess for _, guess in rivals]), labels, run.log)
 

@@ -4,6 +4,7 @@ import contextlib
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,10 +19,10 @@ from slomo.reconstruct.observations import Observations, observe
 from slomo.reconstruct.problem import Problem, Schedule
 from slomo.reconstruct.run import Run, as_arrays
 from slomo.reconstruct.trajectory import Trajectory
-from slomo.skeleton import Skeleton, load_skeleton
+from slomo.skeleton import AUTO, USUAL, Skeleton, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 33
+FIT_VERSION = 34
 
 AGAIN = 0.5  # share of the rates with which the winner is fitted once more, beside one with other limbs
 POLISH = 0.4  # share of the rates with which the chunks of a long clip are polished together
@@ -35,7 +36,7 @@ class FitConfig:
     """Parameters of the fit.
 
     Attributes:
-        skeleton: "quadruped", "human" or the path of a TOML file.
+        skeleton: "auto" (what the clip shows), "quadruped", "human" or the path of a TOML file.
         length_m: m, withers to tail base of a quadruped, standing height of a human; 0: the skeleton's typical length.
         seed: of every random choice.
         fps: fit frames a second at most. subject_px: size of the subject in working pixels (root of its area).
@@ -49,7 +50,7 @@ class FitConfig:
             `surface` are what networks and the user say, where they say anything.
     """
 
-    skeleton: str = "quadruped"
+    skeleton: str = "auto"
     length_m: float = 0.0
     seed: int = 0
     fps: float = 30.0
@@ -118,7 +119,7 @@ def prepare(inputs: Inputs, config: FitConfig) -> Prepared:
     Reads the artifacts "decode" (frames.npz: t), "masks" (masks.npz, flow.npz), "camera" (camera.npz, report.json) and,
     where there is one, "evidence" (evidence.npz), and the file "skeleton" where the user gave one.
     """
-    skeleton = load_skeleton(inputs.files.get("skeleton", config.skeleton))
+    skeleton = load_skeleton(_named(inputs, config))
     decode, masks, camera = (inputs.artifacts[k] for k in ("decode", "masks", "camera"))
     mode = camera.json["report.json"]["mode"]
     obs = observe(
@@ -192,6 +193,15 @@ def _long(
     schedule = replace(_effort(config).schedules[fitting.FINAL], rate=POLISH)
     last = chunks.ChunkProgress(progress, runs, len(where))
     return fitting.polish(made.problem, joined, schedule, seed=config.seed, progress=last)
+
+
+def _named(inputs: Inputs, config: FitConfig) -> str | Path:
+    """The skeleton's name or file: the user's, or the one that the evidence is about."""
+    named = inputs.files.get("skeleton", config.skeleton)
+    if named != AUTO:
+        return named
+    said = inputs.artifacts.get("evidence")
+    return said.json["report.json"]["skeleton"] if said else USUAL
 
 
 def _evidence(inputs: Inputs, obs: Observations, skeleton: Skeleton, weights: dict[str, float]) -> Evidence | None:

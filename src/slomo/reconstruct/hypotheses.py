@@ -123,11 +123,12 @@ def _silent(x: Variables, name: str) -> Variables:
     return x | {k: torch.zeros_like(x[k]) for k in (f"{name}.w{last}", f"{name}.b{last}")}
 
 
-def exchanged(problem: Problem, x: Variables, guess: Guess) -> tuple[Variables, Guess]:
-    """The same motion with the joint angles of left and right legs exchanged, as a guess with no corrections to it."""
+def exchanged(problem: Problem, x: Variables, guess: Guess, links: Tensor | None = None) -> tuple[Variables, Guess]:
+    """The same motion with the joint angles of left and right legs (or of the `links` of both sides) exchanged, as a
+    guess with no corrections to it."""
     x, guess = as_guess(problem, x, guess)
     kin, q = problem.kin, guess.q.clone()
-    legs = torch.tensor(leg_links(kin.skeleton))
+    legs = torch.tensor(leg_links(kin.skeleton)) if links is None else links
     q[:, :, legs] = kin.mirrored(guess.q)[:, :, legs]
     return x, replace(guess, q=q)
 
@@ -155,6 +156,18 @@ def limb_links(skeleton: Skeleton, limb: Limb) -> list[int]:
         out.append(node)
         node = int(skeleton.link[node])
     return out[::-1]
+
+
+def leg_pairs(skeleton: Skeleton) -> list[tuple[str, Tensor, tuple[int, int]]]:
+    """Name, links of both sides, and numbers of the two limbs, of every pair of legs."""
+    out = []
+    for i, limb in enumerate(skeleton.limbs):
+        for j in range(i + 1, len(skeleton.limbs)):
+            if skeleton.mirror[limb.contact] == skeleton.limbs[j].contact:
+                links = torch.tensor([*limb_links(skeleton, limb), *limb_links(skeleton, skeleton.limbs[j])])
+                name = limb.name.replace("left", "").replace("right", "").strip("_") or "legs"
+                out.append((name, links, (i, j)))
+    return out
 
 
 def leg_links(skeleton: Skeleton) -> list[int]:

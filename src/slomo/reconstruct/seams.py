@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from slomo.reconstruct.hypotheses import as_guess, limb_links
+from slomo.reconstruct.hypotheses import as_guess, leg_pairs
 from slomo.reconstruct.problem import Problem, Variables, pick, rank
 from slomo.reconstruct.run import Run, join
 from slomo.reconstruct.trajectory import Guess
-from slomo.skeleton import Skeleton
 
 Array = np.ndarray
 Tensor = torch.Tensor
@@ -78,7 +77,7 @@ def settle(
     for n in range(1, len(runs)):
         before = before or _piece(problem_of(n - 1), out[n - 1], where[n - 1][0])
         here = _piece(problem_of(n), out[n], where[n][0])
-        for name, links, feet in _pairs(here.problem.kin.skeleton):
+        for name, links, feet in leg_pairs(here.problem.kin.skeleton):
             if not _opposed(before, here, feet):
                 continue
             late, guess, span = _best(before, here, links)
@@ -95,18 +94,6 @@ def settle(
 def _piece(problem: Problem, run: Run, first: int) -> Piece:
     x, guess = as_guess(problem, run.x, run.guess)
     return Piece(problem, x, guess, first)
-
-
-def _pairs(skeleton: Skeleton) -> list[tuple[str, Tensor, tuple[int, int]]]:
-    """Name, links of both sides, and numbers of the two limbs, of every pair of legs."""
-    out = []
-    for i, limb in enumerate(skeleton.limbs):
-        for j in range(i + 1, len(skeleton.limbs)):
-            if skeleton.mirror[limb.contact] == skeleton.limbs[j].contact:
-                links = torch.tensor([*limb_links(skeleton, limb), *limb_links(skeleton, skeleton.limbs[j])])
-                name = limb.name.replace("left", "").replace("right", "").strip("_") or "legs"
-                out.append((name, links, (i, j)))
-    return out
 
 
 def _opposed(a: Piece, b: Piece, feet: tuple[int, int]) -> bool:
