@@ -96,7 +96,8 @@ def _margin(log: dict) -> float | None:
 
 def _swap_margin(log: dict) -> float | None:
     """Relative loss by which the winner beats its left-right opposite: among the rivals, else (where the opposite of
-    another one was there) of its gait after the short fits; None where neither was compared."""
+    another one was there) of its gait after the short fits; and, if that is less, the one with a pair of legs exchanged
+    in the end. None where nothing was compared."""
     chosen = _named(log["final"][0])
     rivals = [(_named(e), e["loss"]) for e in log["rivals"]]
     own = next(loss for name, loss in rivals if name == chosen)
@@ -112,7 +113,10 @@ def _swap_margin(log: dict) -> float | None:
             if e["gait"] == chosen["gait"] and abs(abs(e["phase"] - chosen["phase"]) - 0.5) < 0.13
             and abs(e["stride_hz"] / chosen["stride_hz"] - 1) < 0.15
         ]  # fmt: skip
-    return round(min(other) / own - 1, 4) if other else None
+    margins = [min(other) / own - 1] if other else []
+    best, *rest = log["limbs"]
+    margins += [e["loss"] / best["loss"] - 1 for e in rest if e.get("exchanged") != best.get("exchanged")]
+    return round(min(margins), 4) if margins else None
 
 
 def _named(entry: dict) -> dict:

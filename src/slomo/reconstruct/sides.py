@@ -16,6 +16,7 @@ from slomo.reconstruct.trajectory import Guess
 
 BELIEVED = 1 / 3  # share of their weight that networks keep where fitted motions are compared
 OPEN = 0.1  # share by which the loss may be higher with a pair exchanged and nothing fitted to it, to be tried
+APART = 0.02  # body lengths between the feet, on average: legs that stand side by side are the same exchanged
 _SIDED = ("keypoints", "parts", "surface")
 
 
@@ -29,8 +30,18 @@ def doubting(problem: Problem) -> Problem:
 
 
 def exchanged_pairs(problem: Problem, x: Variables, guess: Guess) -> list[tuple[str, Variables, Guess]]:
-    """The motion with one pair of legs exchanged, by the pair's name, wherever that is hardly worse."""
+    """The motion with one pair of legs exchanged, by the pair's name, wherever that is another motion and hardly
+    worse."""
     judge = doubting(problem)
     limit = (1 + OPEN) * float(rank(judge, x, guess)[0])
     found = [(name, *exchanged(problem, x, guess, links)) for name, links, _ in leg_pairs(problem.kin.skeleton)]
+    feet = _feet(problem, x, guess)
+    found = [f for f in found if (_feet(problem, *f[1:]) - feet).norm(dim=-1).mean() > APART]
     return [(name, y, other) for name, y, other in found if float(rank(judge, y, other)[0]) < limit]
+
+
+def _feet(problem: Problem, x: Variables, guess: Guess) -> torch.Tensor:
+    """(F, L, 3) of every fit frame, body lengths."""
+    with torch.no_grad():
+        state = problem.state(x, guess, problem.draw(1, 2, torch.Generator().manual_seed(0)), stance_weight=0.0)
+    return (state.body.nodes[:, :, problem.kin.contacts] / state.body.length)[0]
