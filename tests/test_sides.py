@@ -39,8 +39,8 @@ def test_a_pair_is_exchanged_by_itself():
 
 
 def test_what_the_picture_leaves_open_is_tried():
-    """From the flank a paw is the one or the other; half from the front it is not. Hind legs that stand side by side are
-    the same exchanged."""
+    """From the flank a paw is the one or the other; half from the front it is not. Hind legs side by side are the
+    same exchanged."""
     for yaw, expected in ((0.0, {"front"}), (TOWARDS_CAMERA + 0.7, set())):
         problem, _, x, guess = raising(yaw, slice(0, T))
         assert {name for name, _, _ in sides.exchanged_pairs(problem, x, guess)} == expected
