@@ -139,6 +139,39 @@ class ForgetsWhatIsNear(SeesWhatIsNoGround):
         return seen
 
 
+class ForgetsAFoot(SeesWhatIsNoGround):
+    """What lies under a body does not stand out while the body is at x = 96 to 106."""
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        seen = super().__call__(image)
+        if image.shape[:2] == (H, W) and 96 <= np.nonzero(seen[56] > 0.5)[0].mean() <= 106:
+            seen[75:] = 0
+        return seen
+
+    def crop(self, image: np.ndarray, box: tuple[int, int, int, int]) -> np.ndarray:
+        x0, y0, x1, y1 = box
+        inside = np.zeros(image.shape[:2], bool)
+        inside[y0:y1, x0:x1] = True
+        return self(image) * inside
+
+
+def test_a_foot_that_stands_is_still_the_subjects_when_it_is_seen_again():
+    """It is wider than a leg, and does not share the motion of the body over it, like a box; but it was there."""
+
+    def foot(x, y):
+        return (abs(x) < 10) & (y > 62) & (y < 96)
+
+    def trunk(x, y):
+        return (x / 30) ** 2 + ((y - 56) / 17) ** 2 < 1
+
+    things = [(foot, lambda t: 96.0, RED), (trunk, lambda t: 84 + 1.0 * t, RED)]
+    frames, masks = scene(34, things)
+    found = segment(frames, Choice(0, point=(84.0, 56.0)), ForgetsAFoot())
+    whole = iou(found.masks, masks[0] | masks[1])
+    assert whole[:10].min() > 0.85
+    assert whole[26:].min() > 0.85
+
+
 def test_furniture_that_did_not_stand_out_for_a_while_is_still_there_when_it_is_touched():
     def feeder(x, y):
         return (abs(x) < 14) & (y > 28) & (y < 95)
@@ -234,6 +267,16 @@ def test_shared_motion():
     assert foreign(animal[6] | still[6], animal[6], share)[animal[6]].mean() < 0.05
     assert motion.share(6, np.zeros(2)) is None
     assert motion.liveliness(6, animal[6]) > 1 > motion.liveliness(6, still[6])
+
+
+@pytest.mark.parametrize(("along", "side", "taken"), [(0.0, 12, True), (-1.0, 12, False), (-1.0, 30, True)])
+def test_a_limb_may_go_the_other_way_and_nothing_larger(along: float, side: int, taken: bool):
+    """What only stands is furniture, and what goes the other way and is large is another animal."""
+    whole = np.zeros((H, W), bool)
+    whole[40:90, 60:110] = True
+    share = np.ones((H, W), np.float32)
+    share[50 : 50 + side, 70 : 70 + side] = along
+    assert foreign(whole, whole, share)[50 + side // 2, 70 + side // 2] == taken
 
 
 def test_what_a_body_has_for_as_long_as_it_is_seen_is_its_own_though_it_does_not_move():

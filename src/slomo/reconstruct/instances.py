@@ -87,6 +87,22 @@ def components(mask: np.ndarray, least: float) -> list[np.ndarray]:
     return [labels == i for i in order]
 
 
+def standing_out(probability: np.ndarray) -> list[np.ndarray]:
+    """What stands out in a picture and is more than a fifth of the largest of it."""
+    pieces = components(probability > 0.5, 0.002 * probability.size)
+    return [c for c in pieces if c.sum() > 0.2 * pieces[0].sum()]
+
+
+def clarity_of(probability: np.ndarray, mask: np.ndarray) -> float:
+    """How clearly one whole object, `mask`, stands out: confident, alone, away from the border."""
+    share = mask.mean()
+    if not 0.002 < share < 0.7:
+        return 0.0
+    border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()
+    confident = probability[mask].mean() * mask.sum() / max(1, (probability > 0.5).sum())
+    return float(confident * max(0.0, 1.0 - 4.0 * border) * min(1.0, share / 0.02))
+
+
 def distance(mask: np.ndarray) -> np.ndarray:
     """(H, W) px to the nearest pixel of `mask`; very far where it is empty."""
     if not mask.any():

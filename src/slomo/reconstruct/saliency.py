@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from slomo.reconstruct.flow import Flow, sample
-from slomo.reconstruct.instances import Choice, Look, components, distance, tell_apart
+from slomo.reconstruct.instances import Choice, Look, clarity_of, components, distance, standing_out, tell_apart
 from slomo.reconstruct.instances_motion import ALIKE, MOVES, SharedMotion, foreign
 from slomo.reconstruct.segment import Masks, Report, box_of, component_at, frame_certainty, grown, no_subject
 from slomo.reconstruct.surroundings import give_back_patches, give_back_surroundings
@@ -18,6 +18,7 @@ _SURELY_ALIKE = 0.9  # the same of a piece that does not move as the subject did
 _LASTING = 30  # frames in which it was seen, over which the subject's usual size is taken
 _HELD = 0.4  # probability over time: thin limbs are missed more often than furniture is taken
 _MEMORY = 0.93  # of who is who, from one frame to the next
+_FORGOTTEN = 0.3  # what is left of that of a foot that is not seen, when it may as well be a box: half a second later
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ class SaliencySegmenter:
         for i, k in enumerate(probes):
             whole[k] = self.network(frames[k])
             progress((i + 1) / len(probes))
-        counts = [len(_instances(p)) for p in whole.values()]
+        counts = [len(standing_out(p)) for p in whole.values()]
         if chosen:
             seed = self.choice.frame
             subject = self._pointed_at(frames[seed], whole[seed])
@@ -105,7 +106,7 @@ class SaliencySegmenter:
                         whole[t], bodies[t], speed[t] = p, body, min(v, _FAST)
             # What stands out in one frame may be a box; what moves as well is the better start.
             clarity = {
-                t: _clarity(p, bodies[t]) * (0.1 + speed[t] / (max(speed.values()) + 1)) for t, p in whole.items()
+                t: clarity_of(p, bodies[t]) * (0.1 + speed[t] / (max(speed.values()) + 1)) for t, p in whole.items()
             }
             seed = max(clarity, key=lambda t: clarity[t])
             if clarity[seed] <= 0:
@@ -171,7 +172,7 @@ class _Track:
     def follow(self, order: list[int], tick) -> None:
         """Fill `layers` along the frames `order`, the first of which is the seed."""
         subject, others = self._at_seed
-        resting = np.zeros_like(others)
+        resting, missed = np.zeros_like(others), subject.astype(np.float32)
         x0, y0, x1, y1 = box_of(subject)
         self._sizes = [(x1 - x0, y1 - y0, float(subject.sum()))]
         self._velocity = self.motion.velocity(order[0], subject)
@@ -182,15 +183,23 @@ class _Track:
                     sample(m.astype(np.float32), offset) > 0.5 for m in (subject, others, resting)
                 )
                 before = sample(self.frames[previous].astype(np.float32), offset)
-                resting &= np.abs(before - self.frames[t]).mean(-1) < ALIKE
+                same = np.abs(before - self.frames[t]).mean(-1) < ALIKE
+                resting &= same
+                missed = np.maximum(_MEMORY ** abs(t - previous) * sample(missed, offset), subject) * same
             known = others | resting
-            subject, others = self._look_at(t, subject, known)
-            # Furniture that does not stand out for a while is still there when the subject touches it.
-            resting = known & ~others & ~grown(subject, 0.03) & self.motion.calm(t)
+            subject, others = self._look_at(t, subject, known, missed > _FORGOTTEN)
+            # Furniture that does not stand out for a while is still there when the subject touches it, and a foot that
+            # stands is still the subject's when it stands out again.
+            calm = self.motion.calm(t)
+            resting = known & ~others & ~grown(subject, 0.03) & calm
+            missed *= calm & ~subject & ~others
             tick()
 
-    def _look_at(self, t: int, carried: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Who is who in frame t, from where flow has carried them to; writes the layer."""
+    def _look_at(
+        self, t: int, carried: np.ndarray, others: np.ndarray, missed: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Who is who in frame t, from where flow has carried them to, and what it has `missed` of the subject for a
+        while; writes the layer."""
         frame = self.frames[t]
         if carried.sum() < 0.04 * self._usual()[2]:
             subject, others, seen = self._search(t)
@@ -200,7 +209,7 @@ class _Track:
             alike = lambda piece: self._look.likeness(frame, piece) > _ALIKE  # noqa: E731
             found = seen > 0.5
             share = self.motion.share(t, self.motion.velocity(t, carried & found))
-            astray = foreign(found, carried, share, known=carried & ~others)
+            astray = foreign(found, carried, share, known=(carried | missed) & ~others)
             subject, others, sure = tell_apart(
                 found & ~astray, carried & ~astray, others, alike, share, self._usual()[2]
             )
@@ -282,19 +291,3 @@ class _Track:
             self.layers[k] = np.where(total[k] < 0, 0, self.layers[k]).astype(np.float16)
         self._who = {}  # a third as large as the frames, and settled
         return changed
-
-
-def _instances(probability: np.ndarray) -> list[np.ndarray]:
-    """What stands out in a picture and is more than a fifth of the largest of it."""
-    pieces = components(probability > 0.5, 0.002 * probability.size)
-    return [c for c in pieces if c.sum() > 0.2 * pieces[0].sum()]
-
-
-def _clarity(probability: np.ndarray, mask: np.ndarray) -> float:
-    """How clearly one whole object, `mask`, stands out: confident, alone, away from the border."""
-    share = mask.mean()
-    if not 0.002 < share < 0.7:
-        return 0.0
-    border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()
-    confident = probability[mask].mean() * mask.sum() / max(1, (probability > 0.5).sum())
-    return float(confident * max(0.0, 1.0 - 4.0 * border) * min(1.0, share / 0.02))
