@@ -18,7 +18,6 @@ _SURELY_ALIKE = 0.9  # the same of a piece that does not move as the subject did
 _LASTING = 30  # frames in which it was seen, over which the subject's usual size is taken
 _HELD = 0.4  # probability over time: thin limbs are missed more often than furniture is taken
 _MEMORY = 0.93  # of who is who, from one frame to the next
-_FORGOTTEN = 0.3  # what is left of that of a foot that is not seen, when it may as well be a box: half a second later
 
 
 @dataclass(frozen=True)
@@ -172,7 +171,7 @@ class _Track:
     def follow(self, order: list[int], tick) -> None:
         """Fill `layers` along the frames `order`, the first of which is the seed."""
         subject, others = self._at_seed
-        resting, missed = np.zeros_like(others), subject.astype(np.float32)
+        resting, trusted = np.zeros_like(others), subject.astype(np.float32)
         x0, y0, x1, y1 = box_of(subject)
         self._sizes = [(x1 - x0, y1 - y0, float(subject.sum()))]
         self._velocity = self.motion.velocity(order[0], subject)
@@ -185,21 +184,20 @@ class _Track:
                 before = sample(self.frames[previous].astype(np.float32), offset)
                 same = np.abs(before - self.frames[t]).mean(-1) < ALIKE
                 resting &= same
-                missed = np.maximum(_MEMORY ** abs(t - previous) * sample(missed, offset), subject) * same
+                trusted = sample(trusted, offset) * same
             known = others | resting
-            subject, others = self._look_at(t, subject, known, missed > _FORGOTTEN)
-            # Furniture that does not stand out for a while is still there when the subject touches it, and a foot that
-            # stands is still the subject's when it stands out again.
-            calm = self.motion.calm(t)
-            resting = known & ~others & ~grown(subject, 0.03) & calm
-            missed *= calm & ~subject & ~others
+            subject, others = self._look_at(t, subject, known, trusted > 0.5)
+            trusted = subject + _MEMORY ** max(1, abs(t - previous)) * (trusted - subject)
+            # Furniture that does not stand out for a while is still there when the subject touches it; and a foot that
+            # stands is the subject's when it stands out again.
+            resting = known & ~others & ~grown(subject, 0.03) & self.motion.calm(t)
             tick()
 
     def _look_at(
-        self, t: int, carried: np.ndarray, others: np.ndarray, missed: np.ndarray
+        self, t: int, carried: np.ndarray, others: np.ndarray, trusted: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Who is who in frame t, from where flow has carried them to, and what it has `missed` of the subject for a
-        while; writes the layer."""
+        """Who is who in frame t, from where flow has carried them to, and from what is `trusted` to be the subject's
+        because it mostly was of late; writes the layer."""
         frame = self.frames[t]
         if carried.sum() < 0.04 * self._usual()[2]:
             subject, others, seen = self._search(t)
@@ -209,7 +207,7 @@ class _Track:
             alike = lambda piece: self._look.likeness(frame, piece) > _ALIKE  # noqa: E731
             found = seen > 0.5
             share = self.motion.share(t, self.motion.velocity(t, carried & found))
-            astray = foreign(found, carried, share, known=(carried | missed) & ~others)
+            astray = foreign(found, carried, share, known=(carried | trusted) & ~others)
             subject, others, sure = tell_apart(
                 found & ~astray, carried & ~astray, others, alike, share, self._usual()[2]
             )
