@@ -12,10 +12,11 @@ from slomo.reconstruct import fit, hypotheses, losses, pose_track, silhouette
 from slomo.reconstruct.evidence import gather
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.observations import observe
-from slomo.reconstruct.problem import Problem
+from slomo.reconstruct.problem import Problem, Schedule
 from slomo.reconstruct.run import Run
 from slomo.reconstruct.trajectory import Guess, Trajectory
 from slomo.skeleton import load_skeleton
+from slomo.stage import Silent
 
 T, FPS, W, H = 24, 8.0, 80, 120
 K = Intrinsics(120, 120, 39.5, 59.5, W, H)
@@ -157,3 +158,23 @@ def test_headings_are_told_apart_by_how_far_they_are_turned(raising):
     x = problem.variables(3, torch.Generator().manual_seed(0))
     run = Run(0, x, hypotheses.placed(problem.kin, root, yaw), [{}, {}, {}])
     assert np.degrees(fit._turned(problem, run, 0).numpy()) == pytest.approx([0, 15, 80], abs=0.1)
+
+
+@pytest.mark.parametrize(("far", "strides"), [(0.2, False), (1.5, True)])
+def test_who_stays_in_place_takes_no_strides(raising, monkeypatch, far: float, strides: bool):
+    """A squat may have the rhythm of a walk; who walks there and back has gone somewhere."""
+    monkeypatch.setattr(hypotheses, "gait_grid", lambda *a, **k: [hypotheses.GaitHypothesis("walk", 1.0, 0.0)])
+    problem, root = raising
+    middle = np.stack([far * np.sin(np.linspace(0, np.pi, T)), np.zeros(T)], 1)
+    root = replace(root, middle=middle, speed=np.full(T, 2 * far / (T / FPS)))
+    x = problem.variables(1, torch.Generator().manual_seed(0))
+    guess = hypotheses.placed(problem.kin, root, np.zeros((1, T)))
+    effort = fit.Effort((Schedule(1, 4, 16, ()),) * len(fit.PHASES), candidates=4, phases_of_gait=2)
+    run = fit._to_gait(problem, Run(0, x, guess, [{}], {}), torch.ones(1), root, effort, None, Silent())
+    assert any(label["gait"] != "none" for label in run.labels) == strides
+
+
+def test_all_evidence_tells_front_from_back():
+    labels = [{"gait": "none"}, {"gait": "none", "seen": "turned around"}]
+    assert fit._front_or_back(Run(3, {}, None, labels, {}))  # pyright: ignore[reportArgumentType]
+    assert not fit._front_or_back(Run(3, {}, None, labels[:1], {}))  # pyright: ignore[reportArgumentType]

@@ -25,6 +25,7 @@ TIE = 0.03  # a rival whose loss is higher by this share may still win in the en
 TURNED = 0.1  # the same of one that faces the other way: short fits say little of that
 SAME = math.radians(10.0)  # headings that differ by less are one
 STEPS = 0.04  # share by which the loss without a gait must be lower over more than a body length
+STAYS = 0.3  # body lengths: a person who never gets further from where they began takes no strides
 ALIKE = 0.01  # share by which the loss with strides that are alike may be higher
 ELSEWHERE = 0.1  # body lengths between the feet of two hypotheses that move their legs otherwise, on average
 _MOTION = ("gait", "legs", "seen")
@@ -69,8 +70,8 @@ def fit(
             problem, run.x, run.guess, schedule, generator, start=start, adam_state=adam_state, each=each
         )  # fmt: skip
         start, adam_state = 0, None
-        judge, draws = (problem, 4) if run.phase < FINAL else (sides.doubting(problem), 24)
-        losses = rank(judge, run.x, run.guess, draws=draws)
+        judge = problem if run.phase < FINAL or _front_or_back(run) else sides.doubting(problem)
+        losses = rank(judge, run.x, run.guess, draws=4 if run.phase < FINAL else 24)
         run.log[PHASES[run.phase]] = [
             label | {"loss": round(float(v), 4)} for label, v in zip(run.labels, losses, strict=True)
         ]
@@ -126,6 +127,8 @@ def _to_gait(
     speed = float(np.median(root.speed))
     steps = _steps(problem, root)
     grid = hypotheses.gait_grid(steps, skeleton, leg=kin.leg, speed=speed, metres=metres, phases=effort.phases_of_gait)
+    if skeleton.kind == "human" and np.linalg.norm(root.middle - root.middle[0], axis=1).max() < STAYS * root.length:
+        grid = []  # squats and jumping jacks are no strides
     run.log["stride_candidates_hz"] = sorted({round(g.frequency, 3) for g in grid})
     run.log["stride_clock_power"] = steps.power
     known = {g.name: g for g in skeleton.gaits}
@@ -244,6 +247,11 @@ def _stepping(run: Run, losses: Tensor, root: RootGuess) -> Tensor:
 def _alike(run: Run, losses: Tensor) -> Tensor:
     """(H,) losses to compare by. Where the picture leaves it open strides are alike: their loss may be higher."""
     return losses * torch.tensor([1 - ALIKE * ("strides" in label) for label in run.labels])
+
+
+def _front_or_back(run: Run) -> bool:
+    """Whether a person is compared with one who is turned around: there the picture tells little."""
+    return any("seen" in label for label in run.labels)
 
 
 def _feet_apart(problem: Problem, run: Run, one: int) -> Tensor:
