@@ -11,7 +11,7 @@ from slomo.errors import InvalidData, UsageError
 from slomo.reconstruct.flow import dense_flow
 from slomo.reconstruct.instances import Choice, Look, choose, components, follow, tell_apart
 from slomo.reconstruct.instances_motion import SharedMotion, foreign
-from slomo.reconstruct.saliency import SaliencySegmenter
+from slomo.reconstruct.saliency import SaliencySegmenter, _Track
 from slomo.reconstruct.stage import MasksConfig, run_masks
 from slomo.stage import Artifact, Inputs, Silent
 
@@ -170,6 +170,38 @@ def test_a_foot_that_stands_is_still_the_subjects_when_it_is_seen_again():
     whole = iou(found.masks, masks[0] | masks[1])
     assert whole[:10].min() > 0.85
     assert whole[20:].min() > 0.85
+
+
+class Still:
+    """Flow and motion of a picture in which nothing moves."""
+
+    def chain(self, source: int, target: int) -> np.ndarray:
+        return np.zeros((H, W, 2), np.float32)
+
+    def velocity(self, t: int, mask: np.ndarray) -> np.ndarray:
+        return np.zeros(2)
+
+    def calm(self, t: int) -> np.ndarray:
+        return np.ones((H, W), bool)
+
+
+def test_what_was_the_subjects_of_late_is_trusted_to_be(monkeypatch):
+    trunk, foot, crate = (np.zeros((H, W), bool) for _ in range(3))
+    trunk[40:60, 50:80], foot[70:80, 50:60], crate[40:60, 90:110] = True, True, True
+    nothing, asked = np.zeros((H, W), bool), {}
+
+    def look_at(self, t, carried, others, trusted):
+        asked[t] = trusted
+        return trunk | (foot if t < 10 else nothing) | (crate if t in (5, 20, 21, 22, 23, 24) else nothing), nothing
+
+    monkeypatch.setattr(_Track, "_look_at", look_at)
+    track = _Track(SeesWhatIsNoGround(), np.zeros((40, H, W, 3), np.uint8), Still(), Still(), 0.15, 1)  # pyright: ignore
+    track.start(0, trunk | foot, nothing)
+    track.follow(list(range(40)), lambda: None)
+    assert all(asked[t][trunk].all() for t in range(40))
+    assert [bool(asked[t][foot].all()) for t in (1, 9, 12, 18, 30)] == [True, True, True, True, False]
+    # Taken along for a frame it is not the subject's, after some it is.
+    assert [bool(asked[t][crate].any()) for t in (5, 6, 7, 21, 24, 26)] == [False, False, False, False, True, False]
 
 
 def test_furniture_that_did_not_stand_out_for_a_while_is_still_there_when_it_is_touched():

@@ -18,6 +18,8 @@ _SURELY_ALIKE = 0.9  # the same of a piece that does not move as the subject did
 _LASTING = 30  # frames in which it was seen, over which the subject's usual size is taken
 _HELD = 0.4  # probability over time: thin limbs are missed more often than furniture is taken
 _MEMORY = 0.93  # of who is who, from one frame to the next
+_LATELY = 0.2  # of the last half second in which the subject's own was found to be, from where on flow that carries it
+_MOSTLY = 0.5  # along is believed; and the same where flow does not
 
 
 @dataclass(frozen=True)
@@ -171,7 +173,7 @@ class _Track:
     def follow(self, order: list[int], tick) -> None:
         """Fill `layers` along the frames `order`, the first of which is the seed."""
         subject, others = self._at_seed
-        resting, trusted = np.zeros_like(others), subject.astype(np.float32)
+        resting, trust = np.zeros_like(others), subject.astype(np.float32)
         x0, y0, x1, y1 = box_of(subject)
         self._sizes = [(x1 - x0, y1 - y0, float(subject.sum()))]
         self._velocity = self.motion.velocity(order[0], subject)
@@ -184,10 +186,14 @@ class _Track:
                 before = sample(self.frames[previous].astype(np.float32), offset)
                 same = np.abs(before - self.frames[t]).mean(-1) < ALIKE
                 resting &= same
-                trusted = sample(trusted, offset) * same
+                trust = sample(trust, offset) * same
             known = others | resting
-            subject, others = self._look_at(t, subject, known, trusted > 0.5)
-            trusted = subject + _MEMORY ** max(1, abs(t - previous)) * (trusted - subject)
+            trusted = (subject & (trust > _LATELY)) | (trust > _MOSTLY)
+            subject, others = self._look_at(t, subject, known, trusted)
+            if t == previous:
+                trust = np.maximum(trust, subject)
+            else:
+                trust = subject + _MEMORY ** abs(t - previous) * (trust - subject)
             # Furniture that does not stand out for a while is still there when the subject touches it; and a foot that
             # stands is the subject's when it stands out again.
             resting = known & ~others & ~grown(subject, 0.03) & self.motion.calm(t)
@@ -196,8 +202,9 @@ class _Track:
     def _look_at(
         self, t: int, carried: np.ndarray, others: np.ndarray, trusted: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Who is who in frame t, from where flow has carried them to, and from what is `trusted` to be the subject's
-        because it mostly was of late; writes the layer."""
+        """Who is who in frame t, from where flow has carried them to, and from what is `trusted` to be the subject's by
+        what it was of late: a foot that stands and is seen again, not a box that was it for a frame; writes the
+        layer."""
         frame = self.frames[t]
         if carried.sum() < 0.04 * self._usual()[2]:
             subject, others, seen = self._search(t)
@@ -207,7 +214,7 @@ class _Track:
             alike = lambda piece: self._look.likeness(frame, piece) > _ALIKE  # noqa: E731
             found = seen > 0.5
             share = self.motion.share(t, self.motion.velocity(t, carried & found))
-            astray = foreign(found, carried, share, known=(carried | trusted) & ~others)
+            astray = foreign(found, carried, share, known=trusted & ~others)
             subject, others, sure = tell_apart(
                 found & ~astray, carried & ~astray, others, alike, share, self._usual()[2]
             )
