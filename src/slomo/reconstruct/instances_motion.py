@@ -14,8 +14,6 @@ _SIDE = 256  # px, longer side at which motion is looked at
 _GAP = 4  # frames over which it is taken, either way
 MOVES = 2.0  # px at that size and over that gap, from which on a body as a whole is said to move
 _FOREIGN = 0.2  # part of the body's motion, below which a patch does not share it
-_AGAINST = -0.4  # the same, on average, below which one goes the other way by itself: nothing that only stands does
-_LIMB = 0.25  # part of the body's area, below which what does may be a limb of it
 _LOST = 64.0  # px, a motion that flow cannot have followed
 _ASTRAY = 1.5  # px, median motion of the whole picture, from which on the homography has not been found
 _BENDS = 1.5  # px of motion that no flat thing has, from which on a body is said to be alive
@@ -156,22 +154,17 @@ def foreign(
 ) -> np.ndarray:
     """(H, W) bool, patches of `found` that do not share the subject's motion, as `SharedMotion.share` has it.
 
-    Only what is wider than a leg: a leg that stands has the ground's motion too. Nothing most of which is `known`
-    to be the subject's: a head may turn as it likes. And nothing as small as a limb that goes the other way: an arm
-    that is raised while the body sinks.
+    Only what is wider than a leg: a leg that stands has the ground's motion too. And nothing most of which is `known`
+    to be the subject's: a head may turn as it likes.
     """
     if share is None:
         return np.zeros_like(found)
     calm = found & (share < _FOREIGN)
     patches = calm & _wider_than_a_leg(calm, subject)
-    if patches.any():
+    if known is not None and patches.any():
         labels = np.asarray(cv2.connectedComponents(patches.astype(np.uint8))[1], int)
-        area = np.bincount(labels.ravel())
-        along = np.bincount(labels[patches], share[patches], len(area)) / area
-        own = (along < _AGAINST) & (area < _LIMB * subject.sum())
-        if known is not None:
-            own |= np.bincount(labels[known], minlength=len(area)) > 0.5 * area
-        patches &= ~own[labels]
+        mostly = np.bincount(labels[known], minlength=int(labels.max()) + 1) > 0.5 * np.bincount(labels.ravel())
+        patches &= ~mostly[labels]
     return patches
 
 

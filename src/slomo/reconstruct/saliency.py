@@ -18,8 +18,7 @@ _SURELY_ALIKE = 0.9  # the same of a piece that does not move as the subject did
 _LASTING = 30  # frames in which it was seen, over which the subject's usual size is taken
 _HELD = 0.4  # probability over time: thin limbs are missed more often than furniture is taken
 _MEMORY = 0.93  # of who is who, from one frame to the next
-_LATELY = 0.2  # of the last half second in which the subject's own was found to be, from where on flow that carries it
-_MOSTLY = 0.5  # along is believed; and the same where flow does not
+_TRUSTED = 0.5  # of the last half second in which what stands was found to be the subject's: it still is
 
 
 @dataclass(frozen=True)
@@ -188,23 +187,22 @@ class _Track:
                 resting &= same
                 trust = sample(trust, offset) * same
             known = others | resting
-            trusted = (subject & (trust > _LATELY)) | (trust > _MOSTLY)
-            subject, others = self._look_at(t, subject, known, trusted)
+            calm = self.motion.calm(t)
+            subject, others = self._look_at(t, subject, known, subject | (calm & (trust > _TRUSTED)))
             if t == previous:
                 trust = np.maximum(trust, subject)
             else:
                 trust = subject + _MEMORY ** abs(t - previous) * (trust - subject)
             # Furniture that does not stand out for a while is still there when the subject touches it; and a foot that
             # stands is the subject's when it stands out again.
-            resting = known & ~others & ~grown(subject, 0.03) & self.motion.calm(t)
+            resting = known & ~others & ~grown(subject, 0.03) & calm
             tick()
 
     def _look_at(
         self, t: int, carried: np.ndarray, others: np.ndarray, trusted: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Who is who in frame t, from where flow has carried them to, and from what is `trusted` to be the subject's by
-        what it was of late: a foot that stands and is seen again, not a box that was it for a frame; writes the
-        layer."""
+        """Who is who in frame t, from where flow has carried them to, and from what is `trusted` to be the subject's:
+        that, and a foot that stands and was its own of late; writes the layer."""
         frame = self.frames[t]
         if carried.sum() < 0.04 * self._usual()[2]:
             subject, others, seen = self._search(t)
