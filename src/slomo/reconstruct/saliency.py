@@ -188,13 +188,13 @@ class _Track:
                 trust = sample(trust, offset) * same
             known = others | resting
             calm = self.motion.calm(t)
+            # A foot that stands and is missed for a while is still the subject's when it stands out again.
             subject, others = self._look_at(t, subject, known, subject | (calm & (trust > _TRUSTED)))
             if t == previous:
                 trust = np.maximum(trust, subject)
             else:
                 trust = subject + _MEMORY ** abs(t - previous) * (trust - subject)
-            # Furniture that does not stand out for a while is still there when the subject touches it; and a foot that
-            # stands is the subject's when it stands out again.
+            # Furniture that does not stand out for a while is still there when the subject touches it.
             resting = known & ~others & ~grown(subject, 0.03) & calm
             tick()
 
