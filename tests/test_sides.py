@@ -31,7 +31,7 @@ def raising(yaw: float, when: slice = UP):
 
 def test_a_pair_is_exchanged_by_itself():
     problem, _, x, guess = raising(0.0)
-    for name, links, _ in hypotheses.leg_pairs(KIN.skeleton):
+    for name, links, _ in hypotheses.leg_pairs(KIN):
         _, other = hypotheses.exchanged(problem, x, guess, links)
         moved = (other.q - guess.q)[0].abs().amax((0, 2)) > 1e-6
         raised = {KIN.skeleton.names.index(f"front_{s}_{j}") for s in ("left", "right") for j in RAISED}
@@ -44,6 +44,53 @@ def test_what_the_picture_leaves_open_is_tried():
     for yaw, expected in ((0.0, {"front"}), (TOWARDS_CAMERA + 0.7, set())):
         problem, _, x, guess = raising(yaw, slice(0, T))
         assert {name for name, _, _ in sides.exchanged_pairs(problem, x, guess)} == expected
+
+
+def spread(degrees: float, yaw: float = 0.0):
+    """A person seen from the flank (of a `yaw` of 0) with the legs apart sideways, crossed where that is negative."""
+    kin = Kinematics(load_skeleton("human"))
+    q = np.zeros((T, kin.B, 3))
+    for side, sign in (("left", 1), ("right", -1)):
+        q[:, kin.skeleton.names.index(f"{side}_hip"), 0] = sign * np.radians(degrees)
+    problem, root = problem_of(np.full(T, yaw), q)
+    guess = hypotheses.placed(kin, root, np.full((1, T), yaw))
+    guess = replace(guess, q=torch.as_tensor(q, dtype=torch.float32)[None])
+    return problem, root, problem.variables(1, torch.Generator().manual_seed(0)), guess
+
+
+@pytest.mark.parametrize("degrees", [-20.0, 0.0, 20.0])
+def test_crossed_legs_are_uncrossed_where_they_are_seen(degrees: float):
+    problem, _, x, guess = spread(degrees)
+    found = {name: other for name, *other in sides.exchanged_pairs(problem, x, guess)}
+    assert ("legs, uncrossed" in found) == (degrees < 0)
+    if degrees < 0:
+        now, feet = (sides.feet(problem, *motion)[0] for motion in (found["legs, uncrossed"], (x, guess)))
+        assert (now[:, 0] - now[:, 1])[:, 1].min() > 0.2  # left is left of right
+        hips = 0.11
+        assert (now[:, [1, 0]] - feet).norm(dim=-1).max() < 1.1 * hips
+
+
+def test_legs_may_cross_until_sides_are_settled():
+    values = {}
+    for degrees in (-20.0, 0.0, 20.0):
+        problem, _, x, guess = spread(degrees)
+        problem = replace(problem, weights={"crossed": 1.0})
+        values[degrees] = [float(rank(p, x, guess)[0]) for p in (problem, sides.unsided(problem))]
+    assert values[-20.0][0] > 1
+    assert values[0.0][0] == values[20.0][0] == 0
+    assert all(free == 0 for _, free in values.values())
+
+
+def test_who_stays_in_place_is_turned_around_once_more_with_time_to_settle():
+    problem, root, x, guess = spread(0.0, TOWARDS_CAMERA)
+    run = Run(fit.FINAL, x, guess, [{"gait": "none"}], {"final": [{}], "stride_candidates_hz": []})
+    phases = tuple(Schedule(1, 2, 8, ()) for _ in fit.PHASES)
+    best = fit._to_limbs(problem, run, rank(problem, x, guess), root, fit.Effort(phases, 1, 1))
+    turned = [label.get("seen") for label in best.labels].index("the other way")
+    assert np.degrees(float(best.guess.yaw[turned, 0]) - TOWARDS_CAMERA) % 360 == pytest.approx(180, abs=3)
+    long = fit.Effort((*(replace(p, rate=n) for n, p in enumerate(phases)),), 1, 1)
+    assert [s.rate for s in fit._long_enough(long, problem, root).schedules] == [0, 1, 2, 3, 3]
+    assert fit._long_enough(long, problem, replace(root, travelled=3.0)) is long
 
 
 def test_it_goes_on_beside_the_best_one():

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from slomo.pinhole import Intrinsics
-from slomo.reconstruct import fit, gaits
+from slomo.reconstruct import gaits
 from slomo.reconstruct.gaits import SHORTLIST, Laid, diverse, ranked
 from slomo.reconstruct.hypotheses import GRAVITY, GaitHypothesis, gait_grid, gait_pose
 from slomo.reconstruct.kinematics import Kinematics
@@ -162,6 +162,6 @@ def test_the_phase_next_to_the_best_gait_goes_on_with_it():
         best | {"phase": 0.917},
         best | {"phase": 0.083},
     ]
-    assert fit._next(labels, [1, 2, 3, 4, 5, 6, 7]) == [6]
-    assert fit._next(labels, [1, 2, 3, 4, 5]) == []
-    assert fit._next(labels, []) == []
+    assert gaits.beside(labels, [1, 2, 3, 4, 5, 6, 7]) == [6]
+    assert gaits.beside(labels, [1, 2, 3, 4, 5]) == []
+    assert gaits.beside(labels, []) == []

@@ -51,6 +51,7 @@ def fit(
         metres: body length m, for Froude numbers; None: not known.
         seed: of the draws and of the MLPs' first layers.
     """
+    effort = _long_enough(effort, problem, root)
     generator = torch.Generator().manual_seed(seed)
     run, start, adam_state = restore(progress.load(), generator)
     if run is None:
@@ -66,11 +67,10 @@ def fit(
             if progress.checkpoint_due():
                 progress.save(checkpoint(run, i, optimiser, generator))
 
-        run.x = optimise(
-            problem, run.x, run.guess, schedule, generator, start=start, adam_state=adam_state, each=each
-        )  # fmt: skip
+        at = problem if run.phase == len(PHASES) - 1 else sides.unsided(problem)
+        run.x = optimise(at, run.x, run.guess, schedule, generator, start=start, adam_state=adam_state, each=each)
         start, adam_state = 0, None
-        judge = problem if run.phase < FINAL or _front_or_back(run) else sides.doubting(problem)
+        judge = at if run.phase < FINAL or _front_or_back(run) else sides.doubting(at)
         losses = rank(judge, run.x, run.guess, draws=4 if run.phase < FINAL else 24)
         run.log[PHASES[run.phase]] = [
             label | {"loss": round(float(v), 4)} for label, v in zip(run.labels, losses, strict=True)
@@ -195,11 +195,11 @@ def _to_rivals(problem: Problem, run: Run, losses: Tensor, root: RootGuess, *_) 
     order = losses.argsort().tolist()
     other = [k for k in order if run.labels[k]["gait"] != run.labels[order[0]]["gait"]]
     strides = [k for k in order if "phase" in run.labels[k]]
-    which = torch.tensor(list(dict.fromkeys(order[:2] + other[:1] + _next(run.labels, strides))))
+    which = torch.tensor(list(dict.fromkeys(order[:2] + other[:1] + gaits.beside(run.labels, strides))))
     best = which[:1]
     x, guess = pick(run.x, which), run.guess.pick(which)
     kind, own = problem.kin.skeleton.kind, (problem, pick(run.x, best), run.guess.pick(best))
-    if kind == "human" and root.travelled <= 1:
+    if _either_way(problem, root):
         more = {("seen", "turned around"): hypotheses.turned_around(*own)}
     else:
         more = {("legs", "exchanged"): hypotheses.exchanged(*own)}
@@ -211,18 +211,6 @@ def _to_rivals(problem: Problem, run: Run, losses: Tensor, root: RootGuess, *_) 
     return Run(2, x, join([guess, *(g for _, g in more.values())]), labels, run.log)
 
 
-def _next(labels: list[dict], strides: list[int]) -> list[int]:
-    """Of the hypotheses `strides`, best first, which have a gait: the one that is the first but for a phase next to
-    its own, if there is one."""
-
-    def beside(k: int) -> bool:
-        own, best = labels[k], labels[strides[0]]
-        same = all(own[key] == best[key] for key in ("heading", "gait", "stride_hz"))
-        return same and gaits.turn(own["phase"], best["phase"]) < gaits.NEXT
-
-    return [k for k in strides[1:] if beside(k)][:1]
-
-
 def _to_final(problem: Problem, run: Run, losses: Tensor, root: RootGuess, *_) -> Run:
     """The best one goes on, and with it the best that moves its legs otherwise if it is as good but for `TIE`: by what
     it was made of, or by where its feet are (one gait half a stride later is its left-right opposite). A person who is
@@ -230,7 +218,8 @@ def _to_final(problem: Problem, run: Run, losses: Tensor, root: RootGuess, *_) -
     losses = _stepping(run, losses, root)
     order = losses.argsort().tolist()
     own = run.labels[order[0]]
-    away = _feet_apart(problem, run, order[0]).tolist()
+    feet = sides.feet(problem, run.x, run.guess)
+    away = (feet - feet[order[0]]).norm(dim=-1).mean((1, 2)).tolist()
     other = [k for k in order[1:] if away[k] > ELSEWHERE or any(run.labels[k].get(w) != own.get(w) for w in _MOTION)]
     limit = {k: TIE if run.labels[k].get("seen") == own.get("seen") else TURNED for k in other}
     which = torch.tensor(order[:1] + [k for k in other if losses[k] < (1 + limit[k]) * losses[order[0]]][:1])
@@ -249,22 +238,27 @@ def _alike(run: Run, losses: Tensor) -> Tensor:
     return losses * torch.tensor([1 - ALIKE * ("strides" in label) for label in run.labels])
 
 
+def _either_way(problem: Problem, root: RootGuess) -> bool:
+    """Whether it is a person who stays in place: no path says whether they face the camera or turn their back to it."""
+    return problem.kin.skeleton.kind == "human" and root.travelled <= 1
+
+
+def _long_enough(effort: Effort, problem: Problem, root: RootGuess) -> Effort:
+    """The last phase is as long as the one before for who may be turned around: a third of it says little of that."""
+    *others, last = effort.schedules
+    if not (_either_way(problem, root) and last.iterations):
+        return effort
+    return replace(effort, schedules=(*others, others[FINAL]))
+
+
 def _front_or_back(run: Run) -> bool:
     """Whether a person is compared with one who is turned around: there the picture tells little."""
     return any("seen" in label for label in run.labels)
 
 
-def _feet_apart(problem: Problem, run: Run, one: int) -> Tensor:
-    """(H,) mean distance of the feet of each hypothesis from those of `one`, body lengths."""
-    with torch.no_grad():
-        s = problem.state(run.x, run.guess, problem.draw(1, 2, torch.Generator().manual_seed(0)), stance_weight=0.0)
-        feet = s.body.nodes[:, :, problem.kin.contacts]
-        return (feet - feet[one]).norm(dim=-1).mean((1, 2)) / s.body.length[one]
-
-
 def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, *_) -> Run:
     """The best one goes on, beside it with limbs that are where they are seen better by now, where any are and there is
-    time for it, and with a pair of legs exchanged where that is hardly worse."""
+    time for it, turned around once more, and with a pair of legs exchanged where that is hardly worse."""
     best = _winner(run, _stepping(run, losses, root))
     rivals = [(best.x, best.guess)]
     labels = list(best.labels)
@@ -281,6 +275,9 @@ def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effor
             if found is not None:
                 rivals.append(found)
                 labels.append(labels[-1] | {"strides": "alike"})
+        if _either_way(problem, root):
+            rivals.append(hypotheses.turned_around(problem, best.x, best.guess))
+            labels.append(labels[0] | {"seen": "the other way"})
         for name, x, guess in sides.exchanged_pairs(problem, best.x, best.guess):
             rivals.append((x, guess))
             labels.append(labels[0] | {"exchanged": name})

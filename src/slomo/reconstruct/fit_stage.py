@@ -22,7 +22,7 @@ from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import AUTO, USUAL, Skeleton, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 35
+FIT_VERSION = 36
 
 AGAIN = 0.5  # share of the rates with which the winner is fitted once more, beside one with other limbs
 POLISH = 0.4  # share of the rates with which the chunks of a long clip are polished together
@@ -75,6 +75,7 @@ class FitConfig:
     weight_balance: float = 0.01
     weight_prior: float = 0.05
     weight_facing: float = 0.012
+    weight_crossed: float = 0.03
     weight_view: float = 0.05
     weight_keypoints: float = 0.5
     weight_parts: float = 0.25

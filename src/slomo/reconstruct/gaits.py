@@ -110,6 +110,18 @@ def diverse(entries: list[Laid], count: int) -> list[Laid]:
     return rest[: count - len(more)] + more
 
 
+def beside(labels: list[dict], strides: list[int]) -> list[int]:
+    """Of the hypotheses `strides`, best first, which have a gait: the one that is the first but for a phase next to
+    its own, if there is one."""
+
+    def next_to(k: int) -> bool:
+        own, best = labels[k], labels[strides[0]]
+        same = all(own[key] == best[key] for key in ("heading", "gait", "stride_hz"))
+        return same and turn(own["phase"], best["phase"]) < NEXT
+
+    return [k for k in strides[1:] if next_to(k)][:1]
+
+
 def turn(a: float, b: float) -> float:
     """By how much two phases of a stride differ, in turns: 0 to 0.5."""
     return abs((a - b + 0.5) % 1.0 - 0.5)

@@ -123,13 +123,17 @@ def _silent(x: Variables, name: str) -> Variables:
     return x | {k: torch.zeros_like(x[k]) for k in (f"{name}.w{last}", f"{name}.b{last}")}
 
 
-def exchanged(problem: Problem, x: Variables, guess: Guess, links: Tensor | None = None) -> tuple[Variables, Guess]:
+def exchanged(
+    problem: Problem, x: Variables, guess: Guess, links: Tensor | None = None, *, in_place: bool = False
+) -> tuple[Variables, Guess]:
     """The same motion with the joint angles of left and right legs (or of the `links` of both sides) exchanged, as a
-    guess with no corrections to it."""
+    guess with no corrections to it: each the mirror image of the other, or, `in_place`, where the other one is, but
+    for the width of the hips."""
     x, guess = as_guess(problem, x, guess)
     kin, q = problem.kin, guess.q.clone()
     legs = torch.tensor(leg_links(kin.skeleton)) if links is None else links
-    q[:, :, legs] = kin.mirrored(guess.q)[:, :, legs]
+    other = guess.q[:, :, kin.mirror[: kin.B]] if in_place else kin.mirrored(guess.q)
+    q[:, :, legs] = other[:, :, legs]
     return x, replace(guess, q=q)
 
 
@@ -158,15 +162,13 @@ def limb_links(skeleton: Skeleton, limb: Limb) -> list[int]:
     return out[::-1]
 
 
-def leg_pairs(skeleton: Skeleton) -> list[tuple[str, Tensor, tuple[int, int]]]:
-    """Name, links of both sides, and numbers of the two limbs, of every pair of legs."""
-    out = []
-    for i, limb in enumerate(skeleton.limbs):
-        for j in range(i + 1, len(skeleton.limbs)):
-            if skeleton.mirror[limb.contact] == skeleton.limbs[j].contact:
-                links = torch.tensor([*limb_links(skeleton, limb), *limb_links(skeleton, skeleton.limbs[j])])
-                name = limb.name.replace("left", "").replace("right", "").strip("_") or "legs"
-                out.append((name, links, (i, j)))
+def leg_pairs(kin: Kinematics) -> list[tuple[str, Tensor, tuple[int, int]]]:
+    """Name, links of both sides, and numbers of the two limbs, the left one first, of every pair of legs."""
+    out, skeleton = [], kin.skeleton
+    for left, right in kin.pairs.tolist():
+        links = torch.tensor([link for n in (left, right) for link in limb_links(skeleton, skeleton.limbs[n])])
+        name = skeleton.limbs[left].name.replace("left", "").strip("_") or "legs"
+        out.append((name, links, (left, right)))
     return out
 
 

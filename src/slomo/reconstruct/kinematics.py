@@ -71,8 +71,8 @@ def joint_rotation(q: Tensor) -> Tensor:
 
 
 class Kinematics:
-    """A skeleton's tables as tensors, its mean `leg` length (hip or shoulder over the foot at rest, body lengths), and
-    its forward kinematics."""
+    """A skeleton's tables as tensors, its mean `leg` length (hip or shoulder over the foot at rest, body lengths), the
+    numbers of the left and right limbs of its `pairs` (P, 2), and its forward kinematics."""
 
     def __init__(self, skeleton: Skeleton):
         self.skeleton = skeleton
@@ -106,8 +106,10 @@ class Kinematics:
         ]
         self.place = i(list(itertools.chain(*by_depth))).argsort()
         self.contacts = i(list(skeleton.contacts))
-        high = skeleton.rest()[:, 2]
+        side, high = skeleton.rest()[:, 1:].T
         self.leg = float(np.mean([high[limb.swing] - high[limb.contact] for limb in skeleton.limbs]))
+        feet = list(skeleton.contacts)
+        self.pairs = i([(n, feet.index(skeleton.mirror[foot])) for n, foot in enumerate(feet) if side[foot] > 0])
 
     def shape_variables(self, H: int) -> dict[str, Tensor]:
         """Zeros of every shape variable: the skeleton as written, one unit long."""
@@ -156,3 +158,11 @@ class Kinematics:
         log_r = GIRTH_SPREAD * shape["girth"][:, None, None] + RADIUS_SPREAD * shape["radius"][:, self.flesh_variable]
         radii = self.c_radii * log_r.exp() * length[:, None, None]
         return Posed(torch.cat([ps, tips], 2), Rs, ab[..., 0, :], ab[..., 1, :], radii, length.expand(H))
+
+    def crossing(self, body: Posed, R_root: Tensor) -> Tensor:
+        """(H, T, P) body lengths by which the left one of a pair of legs is to the right of the right one: by where
+        their last links begin, across the root (H, T, 3, 3)."""
+        left, right = self.pairs.T
+        ends = body.nodes[:, :, self.link[self.contacts]]
+        apart = ((ends[:, :, left] - ends[:, :, right]) * R_root[:, :, None, :, 1]).sum(-1)
+        return (-apart).clamp(min=0) / body.length[:, None, None]

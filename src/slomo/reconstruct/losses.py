@@ -223,6 +223,12 @@ def limits(s: State) -> Tensor:
     return 40 * over.square().sum(-1).mean((1, 2)) + 0.3 * rest.mean((1, 2, 3)) + 0.15 * up.mean(1)
 
 
+def crossed(s: State) -> Tensor:
+    """Legs do not cross, which is what they do for long where left is taken for right."""
+    e = (s.kin.crossing(s.body, s.R_root) / 0.1).square()
+    return (e / (1 + 0.1 * e)).mean((1, 2))
+
+
 def forward(s: State) -> Tensor:
     """Animals and people mostly move the way they face: sideways and backward speed, half body lengths / s, robust."""
     p, L = s.body.nodes[:, :, 0, :2], s.body.length[:, None, None]
@@ -290,4 +296,5 @@ def prior(s: State) -> Tensor:
 TERMS: dict[str, Term] = {
     "mask": mask, "reach": reach, "flow": flow, "stance": stance, "ground": ground, "limits": limits, "smooth": smooth,
     "forward": forward, "balance": balance, "prior": prior, "facing": facing,
+    "crossed": crossed,
 }  # fmt: skip

@@ -77,7 +77,7 @@ def settle(
     for n in range(1, len(runs)):
         before = before or _piece(problem_of(n - 1), out[n - 1], where[n - 1][0])
         here = _piece(problem_of(n), out[n], where[n][0])
-        for name, links, feet in leg_pairs(here.problem.kin.skeleton):
+        for name, links, feet in leg_pairs(here.problem.kin):
             if not _opposed(before, here, feet):
                 continue
             late, guess, span = _best(before, here, links)

@@ -11,6 +11,7 @@ from dataclasses import replace
 import torch
 
 from slomo.reconstruct.hypotheses import exchanged, leg_pairs
+from slomo.reconstruct.losses import State
 from slomo.reconstruct.problem import Problem, Variables, rank
 from slomo.reconstruct.trajectory import Guess
 
@@ -29,19 +30,33 @@ def doubting(problem: Problem) -> Problem:
     return replace(problem, weights={k: w * (BELIEVED if k in sided else 1) for k, w in problem.weights.items()})
 
 
+def unsided(problem: Problem) -> Problem:
+    """The problem while nobody knows whose leg is whose: legs may cross, which shows where they are seen."""
+    return replace(problem, weights={**problem.weights, "crossed": 0.0})
+
+
 def exchanged_pairs(problem: Problem, x: Variables, guess: Guess) -> list[tuple[str, Variables, Guess]]:
     """The motion with one pair of legs exchanged, by the pair's name, wherever that is another motion and hardly
-    worse."""
-    judge = doubting(problem)
-    limit = (1 + OPEN) * float(rank(judge, x, guess)[0])
-    found = [(name, *exchanged(problem, x, guess, links)) for name, links, _ in leg_pairs(problem.kin.skeleton)]
-    feet = _feet(problem, x, guess)
-    found = [f for f in found if (_feet(problem, *f[1:]) - feet).norm(dim=-1).mean() > APART]
-    return [(name, y, other) for name, y, other in found if float(rank(judge, y, other)[0]) < limit]
+    worse; and where a pair is crossed, with the two where they are seen, uncrossed."""
+    judge, kin = doubting(unsided(problem)), problem.kin
+    pairs, state, limit = leg_pairs(kin), _posed(problem, x, guess), (1 + OPEN) * float(rank(judge, x, guess)[0])
+    out = []
+    for (name, links, _), by in zip(pairs, kin.crossing(state.body, state.R_root).mean((0, 1)).tolist(), strict=True):
+        other = exchanged(problem, x, guess, links)
+        apart = (feet(problem, *other) - feet(problem, x, guess)).norm(dim=-1).mean()
+        if apart > APART and float(rank(judge, *other)[0]) < limit:
+            out.append((name, *other))
+        if by > APART:
+            out.append((f"{name}, uncrossed", *exchanged(problem, x, guess, links, in_place=True)))
+    return out
 
 
-def _feet(problem: Problem, x: Variables, guess: Guess) -> torch.Tensor:
-    """(F, L, 3) of every fit frame, body lengths."""
+def feet(problem: Problem, x: Variables, guess: Guess) -> torch.Tensor:
+    """(H, F, L, 3) of every fit frame, body lengths of each hypothesis."""
+    body = _posed(problem, x, guess).body
+    return body.nodes[:, :, problem.kin.contacts] / body.length[:, None, None, None]
+
+
+def _posed(problem: Problem, x: Variables, guess: Guess) -> State:
     with torch.no_grad():
-        state = problem.state(x, guess, problem.draw(1, 2, torch.Generator().manual_seed(0)), stance_weight=0.0)
-    return (state.body.nodes[:, :, problem.kin.contacts] / state.body.length)[0]
+        return problem.state(x, guess, problem.draw(1, 2, torch.Generator().manual_seed(0)), stance_weight=0.0)
