@@ -1,6 +1,7 @@
 """Masks: the user's own, the motion segmenter on clips with known answers, and the errors."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -8,10 +9,11 @@ import pytest
 
 from slomo.errors import InvalidData, UsageError
 from slomo.reconstruct.flow import dense_flow
+from slomo.reconstruct.instances_motion import SharedMotion
 from slomo.reconstruct.motion_segment import border_distance
 from slomo.reconstruct.segment import component_at, frame_certainty, frame_quality, spans
 from slomo.reconstruct.stage import DecodeConfig, MasksConfig, pack, run_decode, run_masks, unpack
-from slomo.reconstruct.surroundings import give_back_patches
+from slomo.reconstruct.surroundings import _staying, give_back_patches
 from slomo.reconstruct.votes import vote_over_time
 from slomo.stage import Artifact, Inputs, Silent
 
@@ -96,6 +98,21 @@ def furniture(T: int = 40) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     return np.uint8(np.clip(picture + rng.normal(0, 3, (T, *picture.shape)), 0, 255)), parts
 
 
+def test_a_piece_that_moves_along_with_the_body_is_not_given_back():
+    """In frame 20 it is seen to move along, from 25 on the body rests, which is near enough; in frame 8 it is not."""
+    frames, parts = furniture()
+    flow = dense_flow(frames)
+    bodies = dict.fromkeys(range(len(frames)), parts["body"] | parts["floor"] | parts["box"])
+    moves = {8: 0.0, 20: 1.0}
+    share = lambda k, _: np.where(parts["floor"], moves[k], 0.1) if k in moves else None  # noqa: E731
+    motion = SimpleNamespace(velocity=lambda k, body: body.sum() * 0.0, share=share)
+    gone = parts["floor"] | (parts["box"] & ~parts["body"])
+    for k, stays in ((8, False), (20, True), (30, True), (39, False)):
+        left = _staying(gone, k, bodies, flow, motion)
+        assert left[parts["floor"]].mean() == (0 if stays else 1)
+        assert left[gone & ~parts["floor"]].all()
+
+
 def test_pieces_of_furniture_are_given_back_and_a_head_of_their_colour_is_not():
     frames, parts = furniture()
     flow = dense_flow(frames)
@@ -104,7 +121,7 @@ def test_pieces_of_furniture_are_given_back_and_a_head_of_their_colour_is_not():
         layers[k][parts["floor"]] = 1
     for k in range(20, 26):  # has edges all round, but only these frames take it for the body
         layers[k][parts["box"]] = 1
-    assert give_back_patches(frames, layers, flow) == 28
+    assert give_back_patches(frames, layers, flow, SharedMotion(flow)) == 28
     for k in (0, 15, 23, 39):
         seen = layers[k] > 0.5
         assert seen[parts["body"]].mean() > 0.97

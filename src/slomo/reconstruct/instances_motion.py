@@ -115,7 +115,7 @@ class SharedMotion:
                 there = self._chain(t, k)
                 alike = np.abs(sample(small(frames[k]), there) - here).mean(-1) < ALIKE
                 again |= [alike & (sample(small(m[k]), there) > 0.5) for m in (others, bodies)]
-        wide = [_wider_than_a_leg(body & seen, body).astype(np.uint8) for seen in again]
+        wide = [wider_than_a_leg(body & seen, body).astype(np.uint8) for seen in again]
         other, own = (bodies[t] & (cv2.resize(w, self._flow.size) > 0) for w in wide)
         if other.any():
             if self.liveliness(t, other) < 0.5 * self.liveliness(t, bodies[t] & ~other):
@@ -160,7 +160,7 @@ def foreign(
     if share is None:
         return np.zeros_like(found)
     calm = found & (share < _FOREIGN)
-    patches = calm & _wider_than_a_leg(calm, subject)
+    patches = calm & wider_than_a_leg(calm, subject)
     if known is not None and patches.any():
         labels = np.asarray(cv2.connectedComponents(patches.astype(np.uint8))[1], int)
         mostly = np.bincount(labels[known], minlength=int(labels.max()) + 1) > 0.5 * np.bincount(labels.ravel())
@@ -168,7 +168,7 @@ def foreign(
     return patches
 
 
-def _wider_than_a_leg(patch: np.ndarray, subject: np.ndarray) -> np.ndarray:
+def wider_than_a_leg(patch: np.ndarray, subject: np.ndarray) -> np.ndarray:
     """(H, W) bool, what of a patch is wider than a leg of the subject, and two pixels around it."""
     radius = max(2, round(0.07 * np.sqrt(max(subject.sum(), 1))))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))

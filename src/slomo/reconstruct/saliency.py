@@ -6,7 +6,7 @@ import numpy as np
 
 from slomo.reconstruct.flow import Flow, sample
 from slomo.reconstruct.instances import Choice, Look, clarity_of, components, distance, standing_out, tell_apart
-from slomo.reconstruct.instances_motion import ALIKE, MOVES, SharedMotion, foreign
+from slomo.reconstruct.instances_motion import ALIKE, MOVES, SharedMotion, foreign, wider_than_a_leg
 from slomo.reconstruct.segment import Masks, Report, box_of, component_at, frame_certainty, grown, no_subject
 from slomo.reconstruct.surroundings import give_back_patches, give_back_surroundings
 from slomo.reconstruct.u2net import U2Net
@@ -54,7 +54,7 @@ class SaliencySegmenter:
             track.follow(order, lambda: progress(0.2 + 0.5 * len(track.layers) / len(keys)))
         layers, told = track.layers, track.settle_who_is_who()
         repaired = give_back_surroundings(frames, layers)
-        patched = give_back_patches(frames, layers, flow)
+        patched = give_back_patches(frames, layers, flow, motion)
         progress(0.8)
         probability = vote_over_time(layers, frames, flow, lambda f: progress(0.8 + 0.15 * f))
         masks, certainty = np.empty(frames.shape[:3], bool), np.zeros(T)
@@ -90,12 +90,13 @@ class SaliencySegmenter:
             subject = self._pointed_at(frames[seed], whole[seed])
         else:
             found, bodies = {t: component_at(p > 0.5) for t, p in whole.items()}, {}
-            beside = {t: (whole[t] > 0.5) & ~body for t, body in found.items()}
-            found = {t: component_at(b & ~motion.apart(t, frames, found, beside)) for t, b in found.items()}
+            rest = {t: (whole[t] > 0.5) & ~body for t, body in found.items()}
+            found = {t: component_at(b & ~motion.apart(t, frames, found, rest)) for t, b in found.items()}
             for t, body in found.items():
                 calm = foreign(body, body, motion.share(t, motion.velocity(t, body)))
                 # What it passes it leaves behind, or it stands out no more: its own legs stay with it.
-                bodies[t] = component_at(body & ~(calm & ~motion.lasting(t, calm, found)))
+                left = calm & ~motion.lasting(t, calm, found)
+                bodies[t] = component_at(body & ~(left & wider_than_a_leg(left, body)))
             speed = {t: min(float(np.linalg.norm(motion.velocity(t, b))), _FAST) for t, b in bodies.items()}
             if max(speed.values()) < MOVES:  # what stands out is furniture, or rests
                 for t in probes:

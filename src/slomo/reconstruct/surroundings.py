@@ -7,6 +7,8 @@ import numpy as np
 
 from slomo.reconstruct.colour import ColourModel, cut, learn_colours, to_lab
 from slomo.reconstruct.flow import Flow, inside, sample
+from slomo.reconstruct.instances import components
+from slomo.reconstruct.instances_motion import SharedMotion
 from slomo.reconstruct.segment import grown
 from slomo.threads import in_order
 
@@ -16,6 +18,7 @@ _LEAST = 0.02  # of the mask, a patch that is worth looking at
 _FAINT = 0.6  # outline of a patch against its own edge to the body: furniture goes on beyond the mask
 _APART = (10, 20, 30, 45)  # frames before and after in which a patch is looked for
 _RARELY = 0.5  # of those frames: a patch that is seen less often does not belong to the body
+_ALONG = 0.5  # of the body's motion, from which on a patch moves along with it
 
 
 def give_back_surroundings(frames: np.ndarray, layers: dict[int, np.ndarray]) -> int:
@@ -49,14 +52,15 @@ def give_back_surroundings(frames: np.ndarray, layers: dict[int, np.ndarray]) ->
     return len(swallowing)
 
 
-def give_back_patches(frames: np.ndarray, layers: dict[int, np.ndarray], flow: Flow) -> int:
+def give_back_patches(frames: np.ndarray, layers: dict[int, np.ndarray], flow: Flow, motion: SharedMotion) -> int:
     """Take out of `layers`, in place, pieces of furniture that are less than half of what the function above looks for.
 
     A piece that a cut by colour (learned over the whole clip) would take away goes if it is of the colours of the
     surroundings and one of two things shows that it is theirs: the mask ends in the middle of it, with no edge there
     that is like the one between it and the body; or most frames around do not take the same place, followed along the
-    flow, for the body. A head of the background's colour has an edge all round and is always there. Twice over, because
-    colours are known better once some is gone. Returns the frames concerned.
+    flow, for the body. A head of the background's colour has an edge all round and is always there. A piece that moves
+    along with the body stays. Twice over, because colours are known better once some is gone. Returns the frames
+    concerned.
     """
     bodies = {k: p > 0.5 for k, p in layers.items()}
     changed: set[int] = set()
@@ -67,6 +71,7 @@ def give_back_patches(frames: np.ndarray, layers: dict[int, np.ndarray], flow: F
         model = learn_colours(frames, there, reach=2.0)
         find = partial(_patches, frames, bodies=bodies, model=model, flow=flow)
         taken = {k: gone for k, gone in zip(there, in_order(find, there), strict=True) if gone.any()}
+        taken = {k: left for k, gone in taken.items() if (left := _staying(gone, k, bodies, flow, motion)).any()}
         if not taken:
             break
         changed |= taken.keys()
@@ -102,6 +107,23 @@ def _patches(
         if end < _FAINT * seam or _lasting(piece, k, bodies, flow) < _RARELY:
             gone |= piece
     return gone
+
+
+def _staying(gone: np.ndarray, k: int, bodies: dict[int, np.ndarray], flow: Flow, motion: SharedMotion) -> np.ndarray:
+    """(H, W) bool: what of `gone` in frame k does not share the body's motion there, or, where the body is at rest
+    then, in the nearest of the frames around in which it is not."""
+    left = gone.copy()
+    for other in (k, *(k + d for gap in _APART for d in (gap, -gap))):
+        if other not in bodies or not bodies[other].any():
+            continue
+        share = motion.share(other, motion.velocity(other, bodies[other]))
+        if share is not None:
+            there = sample(share, flow.chain(k, other)) if other != k else share
+            for piece in components(gone, 1):
+                if np.median(np.nan_to_num(there[piece])) > _ALONG:
+                    left &= ~piece
+            break
+    return left
 
 
 def _edges(lab: np.ndarray) -> np.ndarray:
