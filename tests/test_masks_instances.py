@@ -112,6 +112,18 @@ def test_a_small_animal_among_large_things_before_a_camera_that_stands_still():
     assert iou(found.masks, animal).mean() > 0.85
 
 
+def test_what_passes_fast_is_no_animal_when_what_stands_out_is_alive():
+    """A post near a camera that goes around moves more than an animal that walks on the spot that it looks at."""
+
+    def head(x, y):
+        return (x / 14) ** 2 + ((y - 42) / 14) ** 2 < 1
+
+    things = [(post, lambda t: 20 + 1.5 * t, GREY), (body, lambda t: 130 + 0.2 * t, RED),
+              (head, lambda t: 100 + 0.8 * t, RED)]  # fmt: skip
+    frames, (_, trunk, nods) = scene(20, things)
+    assert iou(segment(frames).masks, trunk | nods).min() > 0.8
+
+
 def test_what_an_animal_walks_up_to_is_not_the_animals():
     """It touches a thing as large as itself in a third of the clip, and moves little."""
 

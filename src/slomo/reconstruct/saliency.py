@@ -98,7 +98,8 @@ class SaliencySegmenter:
                 left = calm & ~motion.lasting(t, calm, found)
                 bodies[t] = component_at(body & ~(left & wider_than_a_leg(left, body)))
             speed = {t: min(float(np.linalg.norm(motion.velocity(t, b))), _FAST) for t, b in bodies.items()}
-            if max(speed.values()) < MOVES:  # what stands out is furniture, or rests
+            alive = np.median([motion.liveliness(t, b) for t, b in bodies.items()]) > 1
+            if max(speed.values()) < MOVES and not alive:  # what stands out is furniture, or rests
                 for t in probes:
                     # A paw that one lifts that stands is no animal of its own.
                     movers = [m for m in motion.movers(t) if (m & bodies[t]).sum() < 0.5 * m.sum()]
