@@ -93,6 +93,30 @@ def test_who_stays_in_place_is_turned_around_once_more_with_time_to_settle():
     assert fit._long_enough(long, problem, replace(root, travelled=3.0)) is long
 
 
+def waving(first: str, second: str):
+    """A person seen from the flank who raises one hand for a second and a half, and then one for as long."""
+    problem, root, x, guess = spread(0.0)
+    names = problem.kin.skeleton.names
+    for when, side in ((slice(0, 12), first), (slice(12, T), second)):
+        guess.q[0, when, names.index(f"{side}_shoulder"), 1] = np.radians(-150)
+        guess.q[0, when, names.index(f"{side}_elbow"), 1] = np.radians(-30)
+    return problem, root, x, guess
+
+
+def test_arms_that_change_places_are_kept_apart():
+    problem, _, x, guess = waving("left", "right")
+    found = {name: other for name, _, other in sides.kept_apart(problem, x, guess)}
+    assert [name.split()[:2] for name in found] == [["shoulder", "before"], ["shoulder", "after"]]
+    assert all(abs(float(name.split()[2]) - 1.5) <= sides.MOMENT for name in found)
+    for name, raised, hanging in zip(found, ("right", "left"), ("left", "right"), strict=True):
+        shoulder = {s: problem.kin.skeleton.names.index(f"{s}_shoulder") for s in ("left", "right")}
+        pitch = found[name].q[0, :, :, 1].numpy()
+        np.testing.assert_allclose(pitch[:, shoulder[raised]], np.radians(-150), atol=1e-5)
+        np.testing.assert_allclose(pitch[:, shoulder[hanging]], 0, atol=1e-5)
+    problem, _, x, guess = waving("left", "left")
+    assert sides.kept_apart(problem, x, guess) == []
+
+
 def test_it_goes_on_beside_the_best_one():
     problem, root, x, guess = raising(0.0)
     run = Run(fit.FINAL, x, guess, [{"gait": "none"}], {"final": [{}]})

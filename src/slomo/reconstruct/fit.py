@@ -258,7 +258,8 @@ def _front_or_back(run: Run) -> bool:
 
 def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, *_) -> Run:
     """The best one goes on, beside it with limbs that are where they are seen better by now, where any are and there is
-    time for it, turned around once more, and with a pair of legs exchanged where that is hardly worse."""
+    time for it, and with a pair of legs exchanged where that is hardly worse; of a person who stays in place turned
+    around once more, and with limbs kept apart that change places."""
     best = _winner(run, _stepping(run, losses, root))
     rivals = [(best.x, best.guess)]
     labels = list(best.labels)
@@ -275,12 +276,13 @@ def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effor
             if found is not None:
                 rivals.append(found)
                 labels.append(labels[-1] | {"strides": "alike"})
+        more = [("exchanged", *rival) for rival in sides.exchanged_pairs(problem, best.x, best.guess)]
         if _either_way(problem, root):
-            rivals.append(hypotheses.turned_around(problem, best.x, best.guess))
-            labels.append(labels[0] | {"seen": "the other way"})
-        for name, x, guess in sides.exchanged_pairs(problem, best.x, best.guess):
+            more.append(("seen", "the other way", *hypotheses.turned_around(problem, best.x, best.guess)))
+            more += [("apart", *rival) for rival in sides.kept_apart(problem, best.x, best.guess)]
+        for key, name, x, guess in more:
             rivals.append((x, guess))
-            labels.append(labels[0] | {"exchanged": name})
+            labels.append(labels[0] | {key: name})
     x = {k: torch.cat([x[k] for x, _ in rivals]) for k in best.x}
     return Run(run.phase + 1, x, join([guess for _, guess in rivals]), labels, run.log)
 

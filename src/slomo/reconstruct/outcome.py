@@ -97,7 +97,7 @@ def _margin(log: dict) -> float | None:
 def _swap_margin(log: dict) -> float | None:
     """Relative loss by which the winner beats its left-right opposite: among the rivals, else (where the opposite of
     another one was there) of its gait after the short fits; and, if that is less, the one with a pair of legs exchanged
-    in the end. None where nothing was compared."""
+    in the end. A person turned around is the one of the end, where there is one. None where nothing was compared."""
     chosen = _named(log["final"][0])
     rivals = [(_named(e), e["loss"]) for e in log["rivals"]]
     own = next(loss for name, loss in rivals if name == chosen)
@@ -113,9 +113,11 @@ def _swap_margin(log: dict) -> float | None:
             if e["gait"] == chosen["gait"] and abs(abs(e["phase"] - chosen["phase"]) - 0.5) < 0.13
             and abs(e["stride_hz"] / chosen["stride_hz"] - 1) < 0.15
         ]  # fmt: skip
-    margins = [min(other) / own - 1] if other else []
     best, *rest = log["limbs"]
-    margins += [e["loss"] / best["loss"] - 1 for e in rest if e.get("exchanged") != best.get("exchanged")]
+    turned = [e for e in rest if e.get("seen") != best.get("seen")]
+    margins = [min(other) / own - 1] if other and not turned else []
+    opposite = [*turned, *(e for e in rest if e.get("exchanged") != best.get("exchanged"))]
+    margins += [e["loss"] / best["loss"] - 1 for e in opposite]
     return round(min(margins), 4) if margins else None
 
 

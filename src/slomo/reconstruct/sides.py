@@ -6,11 +6,13 @@ misleads them in the next, so that a hundred of their frames weigh little more t
 are other ones in every frame.
 """
 
+import math
 from dataclasses import replace
 
 import torch
 
-from slomo.reconstruct.hypotheses import exchanged, leg_pairs
+from slomo.reconstruct.hypotheses import as_guess, exchanged, leg_pairs
+from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.losses import State
 from slomo.reconstruct.problem import Problem, Variables, rank
 from slomo.reconstruct.trajectory import Guess
@@ -18,6 +20,8 @@ from slomo.reconstruct.trajectory import Guess
 BELIEVED = 1 / 3  # share of their weight that networks keep where fitted motions are compared
 OPEN = 0.1  # share by which the loss may be higher with a pair exchanged and nothing fitted to it, to be tried
 APART = 0.02  # body lengths between the feet, on average: legs that stand side by side are the same exchanged
+MOMENT = 0.3  # s before and after the moment in which a pair of limbs changes places
+CHANGED = math.radians(60)  # by which a pair's joints must move less in sum, mirrored, to have changed places
 _SIDED = ("keypoints", "parts", "surface")
 
 
@@ -48,6 +52,46 @@ def exchanged_pairs(problem: Problem, x: Variables, guess: Guess) -> list[tuple[
             out.append((name, *other))
         if by > APART:
             out.append((f"{name}, uncrossed", *exchanged(problem, x, guess, links, in_place=True)))
+    return out
+
+
+def kept_apart(problem: Problem, x: Variables, guess: Guess) -> list[tuple[str, Variables, Guess]]:
+    """The motion with a pair of limbs that change places in it kept apart: exchanged before the moment in which the
+    left one takes the right one's place and the other way round, and, another motion, after it."""
+    x, guess = as_guess(problem, x, guess)
+    t, kin, out = problem.obs.t, problem.kin, []
+    reach = max(1, round(MOMENT / float((t[1:] - t[:-1]).median())))
+    for name, links in _paired_links(kin):
+        q, other = guess.q[0][:, links], kin.mirrored(guess.q)[0][:, links]
+        before, after = q[: -2 * reach], slice(2 * reach, None)
+        changed = (before - q[after]).abs().sum((1, 2)) - (before - other[after]).abs().sum((1, 2))
+        if not len(changed) or changed.max() < CHANGED:
+            continue
+        at = int(changed.argmax()) + reach
+        for when, now in (("before", torch.arange(len(t)) < at), ("after", torch.arange(len(t)) >= at)):
+            new = torch.where(now[:, None, None], other, q)
+            share = torch.linspace(0, 1, 2 * reach + 1)[:, None, None]
+            new[at - reach : at + reach + 1] = torch.lerp(new[at - reach], new[at + reach], share)
+            whole = guess.q.clone()
+            whole[0, :, links] = new
+            out.append((f"{name} {when} {float(t[at]):.2f} s", x, replace(guess, q=whole)))
+    return out
+
+
+def _paired_links(kin: Kinematics) -> list[tuple[str, torch.Tensor]]:
+    """Every pair of limbs, arms as well as legs, by the joint where it begins: the links of both sides."""
+    out = []
+    for first in range(1, kin.B):
+        pair = {first, int(kin.mirror[first])}
+        trunk = int(kin.link[first])
+        if min(pair) < first or len(pair) == 1 or int(kin.mirror[trunk]) != trunk:
+            continue
+        links: set[int] = set()
+        for link in range(1, kin.B):  # what they hang from comes before them
+            if link in pair or int(kin.link[link]) in links:
+                links.add(link)
+        name = kin.skeleton.names[first].replace("left", "").replace("right", "").strip("_")
+        out.append((name, torch.tensor(sorted(links))))
     return out
 
 
