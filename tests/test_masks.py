@@ -1,5 +1,6 @@
 """Masks: the user's own, the motion segmenter on clips with known answers, and the errors."""
 
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,6 +12,7 @@ from slomo.errors import InvalidData, UsageError
 from slomo.reconstruct.flow import dense_flow
 from slomo.reconstruct.instances_motion import SharedMotion
 from slomo.reconstruct.motion_segment import border_distance
+from slomo.reconstruct.passing import give_back_what_passes
 from slomo.reconstruct.segment import component_at, frame_certainty, frame_quality, spans
 from slomo.reconstruct.stage import DecodeConfig, MasksConfig, pack, run_decode, run_masks, unpack
 from slomo.reconstruct.surroundings import _staying, give_back_patches
@@ -96,6 +98,39 @@ def furniture(T: int = 40) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     picture[parts["body"]] = 215, 185, 140
     rng = np.random.default_rng(0)
     return np.uint8(np.clip(picture + rng.normal(0, 3, (T, *picture.shape)), 0, 255)), parts
+
+
+class Resting:
+    """Motion of a picture in which nothing moves; of some frames flow is not known."""
+
+    size = (200, 120)
+
+    def __init__(self, lost: Callable[[int], bool] = lambda k: False):
+        self.lost = lost
+
+    def chain(self, source: int, target: int) -> np.ndarray:
+        there = 500.0 if self.lost(source) != self.lost(target) else 0.0
+        return np.full((*self.size[::-1], 2), there, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("joins", "lost", "stays"),
+    [
+        (range(25, 45), None, False),  # a box that it stands before
+        (range(25, 80), None, True),  # whoever has it for longer than not
+        (range(25, 45), range(25, 45), True),  # what is not seen before and after, behind a post, may be its own
+    ],
+)
+def test_what_joins_for_a_while_is_given_back(joins, lost, stays):
+    _, parts = furniture(1)
+    box = parts["box"] & ~parts["body"]
+    layers = {k: (parts["body"] | (box if k in joins else False)).astype(np.float16) for k in range(80)}
+    motion = Resting(lambda k: lost is not None and k in lost)
+    taken = give_back_what_passes(layers, motion)  # pyright: ignore[reportArgumentType]
+    assert (taken == 0) == stays
+    for k in (0, 26, 35, 44, 79):
+        assert (layers[k] > 0.5)[parts["body"]].mean() > 0.99
+        assert (layers[k] > 0.5)[box].mean() == pytest.approx(float(k in joins and stays), abs=0.02)
 
 
 def test_a_piece_that_moves_along_with_the_body_is_not_given_back():

@@ -29,7 +29,7 @@ class SharedMotion:
     def __init__(self, flow: Flow):
         self._flow = flow
         self._factor = _SIDE / max(flow.size)
-        self._size = (round(flow.size[0] * self._factor), round(flow.size[1] * self._factor))
+        self.size = (round(flow.size[0] * self._factor), round(flow.size[1] * self._factor))
         self._known: dict[int, np.ndarray] = {}
         self._drift: dict[int, float] = {}  # px, median motion of the whole picture
 
@@ -41,7 +41,7 @@ class SharedMotion:
             ends = [u for u in (t - _GAP, t + _GAP) if 0 <= u <= last] or [last if t < last / 2 else 0]
             fields, errors, drift = [], [], []
             for u in ends:
-                there, back = self._chain(t, u), self._chain(u, t)
+                there, back = self.chain(t, u), self.chain(u, t)
                 drift.append(float(np.median(np.linalg.norm(there, axis=-1))) * _GAP / abs(u - t))
                 fields.append(residual_motion(there) * (_GAP / (u - t)))
                 errors.append(np.linalg.norm(there + sample(back, there), axis=-1, keepdims=True))
@@ -65,7 +65,7 @@ class SharedMotion:
         """How surely (H, W) bool is alive in frame t; from 1 on it is: it moves fast as a whole, or its liveliest tenth
         moves in a way that no flat thing does (what an affine motion leaves), as parallax cannot make a box do. Before
         a camera that stands still nothing but noise moves a thing, and much less is enough."""
-        small = cv2.resize(mask.astype(np.float32), self._size, interpolation=cv2.INTER_AREA) > 0.9
+        small = cv2.resize(mask.astype(np.float32), self.size, interpolation=cv2.INTER_AREA) > 0.9
         y, x = np.nonzero(small & np.isfinite(self.residual(t)[..., 0]))
         if len(x) < 20:
             return 0.0
@@ -94,11 +94,11 @@ class SharedMotion:
     def lasting(self, t: int, patch: np.ndarray, bodies: Mapping[int, np.ndarray]) -> np.ndarray:
         """(H, W) bool, what of a patch (H, W) in frame t lies in the body (H, W) bool of every frame of `bodies`, where
         the flow carries it there."""
-        small = cv2.resize(patch.astype(np.uint8), self._size, interpolation=cv2.INTER_NEAREST) > 0
+        small = cv2.resize(patch.astype(np.uint8), self.size, interpolation=cv2.INTER_NEAREST) > 0
         for k, body in bodies.items():
             if k != t and small.any():
-                there = cv2.resize(body.astype(np.float32), self._size, interpolation=cv2.INTER_AREA)
-                small &= sample(there, self._chain(t, k)) > 0.5
+                there = cv2.resize(body.astype(np.float32), self.size, interpolation=cv2.INTER_AREA)
+                small &= sample(there, self.chain(t, k)) > 0.5
         return patch & (cv2.resize(small.astype(np.uint8), self._flow.size, interpolation=cv2.INTER_NEAREST) > 0)
 
     def apart(
@@ -107,12 +107,12 @@ class SharedMotion:
         """(H, W) bool, what of the body in frame t is no part of it: a box that it touches now. In another frame of
         `bodies` it is seen again, looking the same and where the flow carries it, but as one of two things apart: the
         body there and what stands out beside it, `others`. The less lively of the two is not the body."""
-        small = lambda m: cv2.resize(m.astype(np.float32), self._size, interpolation=cv2.INTER_AREA)  # noqa: E731
+        small = lambda m: cv2.resize(m.astype(np.float32), self.size, interpolation=cv2.INTER_AREA)  # noqa: E731
         here, body = small(frames[t]), small(bodies[t]) > 0.5
         again = np.zeros((2, *body.shape), bool)
         for k in bodies:
             if k != t and others[k].any():
-                there = self._chain(t, k)
+                there = self.chain(t, k)
                 alike = np.abs(sample(small(frames[k]), there) - here).mean(-1) < ALIKE
                 again |= [alike & (sample(small(m[k]), there) > 0.5) for m in (others, bodies)]
         wide = [wider_than_a_leg(body & seen, body).astype(np.uint8) for seen in again]
@@ -126,7 +126,7 @@ class SharedMotion:
 
     def _inside(self, t: int, mask: np.ndarray) -> np.ndarray:
         """(n, 2) what of the residual is known and lies in (H, W) bool."""
-        small = cv2.resize(mask.astype(np.float32), self._size, interpolation=cv2.INTER_AREA) > 0.9
+        small = cv2.resize(mask.astype(np.float32), self.size, interpolation=cv2.INTER_AREA) > 0.9
         inside = self.residual(t)[np.asarray(small)]
         return inside[np.isfinite(inside[:, 0])]
 
@@ -138,13 +138,13 @@ class SharedMotion:
             return None
         return cv2.resize(self.residual(t) @ (velocity / speed**2), self._flow.size, interpolation=cv2.INTER_NEAREST)
 
-    def _chain(self, source: int, target: int) -> np.ndarray:
+    def chain(self, source: int, target: int) -> np.ndarray:
         """(h, w, 2) px at `_SIDE` from frame `source` to `target`."""
-        total = np.zeros((self._size[1], self._size[0], 2), np.float32)
+        total = np.zeros((self.size[1], self.size[0], 2), np.float32)
         direction = 1 if target > source else -1
         for t in range(source, target, direction):
             field = self._flow.forward[t] if direction > 0 else self._flow.backward[t - 1]
-            small = cv2.resize(field.astype(np.float32), self._size, interpolation=cv2.INTER_AREA)
+            small = cv2.resize(field.astype(np.float32), self.size, interpolation=cv2.INTER_AREA)
             total += sample(self._factor * small, total)
         return total
 

@@ -7,6 +7,7 @@ import numpy as np
 from slomo.reconstruct.flow import Flow, sample
 from slomo.reconstruct.instances import Choice, Look, clarity_of, components, distance, standing_out, tell_apart
 from slomo.reconstruct.instances_motion import ALIKE, MOVES, SharedMotion, foreign, wider_than_a_leg
+from slomo.reconstruct.passing import give_back_what_passes
 from slomo.reconstruct.segment import Masks, Report, box_of, component_at, frame_certainty, grown, no_subject
 from slomo.reconstruct.surroundings import give_back_patches, give_back_surroundings
 from slomo.reconstruct.u2net import U2Net
@@ -53,8 +54,9 @@ class SaliencySegmenter:
         for order in (keys[keys.index(seed) :], keys[: keys.index(seed) + 1][::-1]):
             track.follow(order, lambda: progress(0.2 + 0.5 * len(track.layers) / len(keys)))
         layers, told = track.layers, track.settle_who_is_who()
-        repaired = give_back_surroundings(frames, layers)
-        patched = give_back_patches(frames, layers, flow, motion)
+        given_back = {"colour_repaired_frames": give_back_surroundings(frames, layers)}
+        given_back |= {"passed_frames": give_back_what_passes(layers, motion)}
+        given_back |= {"patched_frames": give_back_patches(frames, layers, flow, motion)}
         progress(0.8)
         probability = vote_over_time(layers, frames, flow, lambda f: progress(0.8 + 0.15 * f))
         masks, certainty = np.empty(frames.shape[:3], bool), np.zeros(T)
@@ -70,7 +72,7 @@ class SaliencySegmenter:
             raise no_subject("what stands out in the picture never moves against the background")
         report |= {"weights_sha256": self.network.digest, "network_frames": len(keys), "seed_frame": seed}
         report |= {"frames_with_others": told, "frames_lost": sum(not p.any() for p in layers.values())}
-        return Masks(masks, certainty, report | {"colour_repaired_frames": repaired, "patched_frames": patched})
+        return Masks(masks, certainty, report | given_back)
 
     def _start(self, keys: list[int], frames: np.ndarray, motion: SharedMotion, progress: Report):
         """The frame to start from, the subject and the others in it (H, W) bool, and what the report says of that.
