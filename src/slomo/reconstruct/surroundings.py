@@ -19,6 +19,7 @@ _FAINT = 0.6  # outline of a patch against its own edge to the body: furniture g
 _APART = (10, 20, 30, 45)  # frames before and after in which a patch is looked for
 _RARELY = 0.5  # of those frames: a patch that is seen less often does not belong to the body
 _ALONG = 0.5  # of the body's motion, from which on a patch moves along with it
+_NEARLY = 0.2  # of the patch may not: flow carries the rim of a plain wall along with what is before it
 
 
 def give_back_surroundings(frames: np.ndarray, layers: dict[int, np.ndarray]) -> int:
@@ -120,7 +121,7 @@ def _staying(gone: np.ndarray, k: int, bodies: dict[int, np.ndarray], flow: Flow
         if share is not None:
             there = sample(share, flow.chain(k, other)) if other != k else share
             for piece in components(gone, 1):
-                if np.median(np.nan_to_num(there[piece])) > _ALONG:
+                if np.quantile(np.nan_to_num(there[piece]), _NEARLY) > _ALONG:
                     left &= ~piece
             break
     return left
