@@ -81,6 +81,16 @@ def test_legs_may_cross_until_sides_are_settled():
     assert all(free == 0 for _, free in values.values())
 
 
+def test_a_skeleton_without_pairs_of_legs_has_none_that_cross():
+    skeleton = replace(load_skeleton("human"), limbs=load_skeleton("human").limbs[:1])
+    kin = Kinematics(skeleton)
+    assert kin.pairs.shape == (0, 2)
+    assert hypotheses.leg_pairs(kin) == []
+    problem, _, x, guess = spread(-20.0)
+    problem = replace(problem, kin=kin, weights={"crossed": 1.0})
+    assert float(rank(problem, x, guess)[0]) == 0
+
+
 def test_who_stays_in_place_is_turned_around_once_more_with_time_to_settle():
     problem, root, x, guess = spread(0.0, TOWARDS_CAMERA)
     run = Run(fit.FINAL, x, guess, [{"gait": "none"}], {"final": [{}], "stride_candidates_hz": []})

@@ -108,8 +108,9 @@ class Kinematics:
         self.contacts = i(list(skeleton.contacts))
         side, high = skeleton.rest()[:, 1:].T
         self.leg = float(np.mean([high[limb.swing] - high[limb.contact] for limb in skeleton.limbs]))
-        feet = list(skeleton.contacts)
-        self.pairs = i([(n, feet.index(skeleton.mirror[foot])) for n, foot in enumerate(feet) if side[foot] > 0])
+        number = {foot: n for n, foot in enumerate(skeleton.contacts)}
+        other = {n: number.get(skeleton.mirror[foot]) for foot, n in number.items() if side[foot] > 0}
+        self.pairs = i([pair for pair in other.items() if pair[1] is not None]).reshape(-1, 2)
 
     def shape_variables(self, H: int) -> dict[str, Tensor]:
         """Zeros of every shape variable: the skeleton as written, one unit long."""

@@ -226,7 +226,7 @@ def limits(s: State) -> Tensor:
 def crossed(s: State) -> Tensor:
     """Legs do not cross, which is what they do for long where left is taken for right."""
     e = (s.kin.crossing(s.body, s.R_root) / 0.1).square()
-    return (e / (1 + 0.1 * e)).mean((1, 2))
+    return (e / (1 + 0.1 * e)).sum(2).mean(1) / max(len(s.kin.pairs), 1)
 
 
 def forward(s: State) -> Tensor:

@@ -12,11 +12,11 @@ from slomo.reconstruct.segment import grown
 _APART = (10, 20, 30, 45)  # frames before and after in which a place is looked for
 _GROWN = 1.15  # of the usual area in those frames, from which on something may have joined
 _RARELY = 0.4  # of those frames in which a place is seen: what is the body's less often is not its own
+_MOSTLY = 0.7  # likewise, from which on it surely is
 _SEEN = 3  # frames in which a place must be seen again
 _BACK = 2.0  # px at the size of shared motion, within which flow there and back again must lead home
-_MOSTLY = 0.7  # likewise, from which on it surely is
 _RIM = 0.15  # roots of the body's area, how wide the edges of what passes are at most
-_TIMES = 4
+_TIMES = 4  # over, at most
 _LEAST = 0.04  # of the body, what is worth a look
 
 
@@ -26,11 +26,10 @@ def give_back_what_passes(layers: dict[int, np.ndarray], motion: SharedMotion) -
     frame speaks against it in the next. Returns the frames concerned."""
     bodies = {k: p > 0.5 for k, p in layers.items() if (p > 0.5).any()}
     small = {k: cv2.resize(b.astype(np.float32), motion.size, interpolation=cv2.INTER_AREA) for k, b in bodies.items()}
-    homes: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
     gone: dict[int, np.ndarray] = {}
     for _ in range(_TIMES):
         area = {k: float(s.sum()) for k, s in small.items()}
-        found = {k: _passing(k, small, area, motion, homes) for k in small}
+        found = {k: _passing(k, small, area, motion) for k in small}
         found = {k: f for k, f in found.items() if f.any()}
         if not found:
             break
@@ -43,25 +42,17 @@ def give_back_what_passes(layers: dict[int, np.ndarray], motion: SharedMotion) -
     return len(gone)
 
 
-def _passing(
-    k: int,
-    bodies: dict[int, np.ndarray],
-    area: dict[int, float],
-    motion: SharedMotion,
-    homes: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]],
-) -> np.ndarray:
-    """(h, w) bool: what of body k is rarely seen as the body's around. `homes` keeps what was found out about flow."""
+def _passing(k: int, bodies: dict[int, np.ndarray], area: dict[int, float], motion: SharedMotion) -> np.ndarray:
+    """(h, w) bool: what of body k is rarely seen as the body's around."""
     body = bodies[k] > 0.5
     around = [o for d in _APART for o in (k - d, k + d) if o in bodies]
     if len(around) < _SEEN or area[k] < _GROWN * np.median([area[o] for o in around]):
         return np.zeros_like(body)
     own, seen = np.zeros(body.shape), np.zeros(body.shape)
     for o in around:
-        if (k, o) not in homes:
-            there = motion.chain(k, o)
-            home = np.linalg.norm(there + sample(motion.chain(o, k), there), axis=-1) < _BACK
-            homes[k, o] = there, home & inside(there)
-        there, known = homes[k, o]
+        there = motion.chain(k, o)
+        home = np.linalg.norm(there + sample(motion.chain(o, k), there), axis=-1) < _BACK
+        known = home & inside(there)
         own += known * (sample(bodies[o], there) > 0.5)
         seen += known
     rarely = body & (seen >= _SEEN) & (own < _RARELY * seen)

@@ -60,6 +60,8 @@ def kept_apart(problem: Problem, x: Variables, guess: Guess) -> list[tuple[str, 
     left one takes the right one's place and the other way round, and, another motion, after it."""
     x, guess = as_guess(problem, x, guess)
     t, kin, out = problem.obs.t, problem.kin, []
+    if len(t) < 2:
+        return out
     reach = max(1, round(MOMENT / float((t[1:] - t[:-1]).median())))
     for name, links in _paired_links(kin):
         q, other = guess.q[0][:, links], kin.mirrored(guess.q)[0][:, links]
