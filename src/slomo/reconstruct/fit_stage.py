@@ -46,7 +46,8 @@ class FitConfig:
         candidates: hypotheses that are fitted in the gait phase, at least one without a gait for each heading that is
             left (one or two); gait_phases: phases tried of each gait.
         tilt_moving_deg, tilt_static_deg: s.d. of the given gravity for a camera that moved, and for one that did not.
-        weight_*: of the evidence; 0 switches a term off. `facing` is for people only; `view`, `keypoints`, `parts` and
+        weight_*: of the evidence; 0 switches a term off. `facing` is for people only, `crossed` (legs) counts in the
+            last phase only; `view`, `keypoints`, `parts` and
             `surface` are what networks and the user say, where they say anything.
     """
 
