@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from slomo.reconstruct.outcome import _swap_margin
 from slomo.reconstruct.verdict import Check, Facts, checks, floating, verdict
 
 GOOD = Facts(
@@ -74,3 +75,25 @@ def test_floating_is_the_longest_time_aloft():
     height[5, 1] = 0.5
     assert floating(height, t) == pytest.approx(0.3)
     assert floating(np.zeros((10, 2)), t) == 0.0
+
+
+def _log(*limbs: dict) -> dict:
+    """Of a person who stays in place, worse among the rivals than the one turned around, by a fiftieth."""
+    own = {"heading": "front", "gait": "none"}
+    turned = own | {"seen": "turned around"}
+    rivals = [own | {"loss": 0.51}, turned | {"loss": 0.5}]
+    return {"rivals": rivals, "final": [own | {"loss": 0.45}], "limbs": [own | entry for entry in limbs]}
+
+
+@pytest.mark.parametrize(
+    ("limbs", "margin"),
+    [
+        ([{"loss": 0.4}], -0.0196),
+        ([{"loss": 0.4}, {"seen": "the other way", "loss": 0.42}], 0.05),  # fitted for longer than the rivals
+        ([{"seen": "the other way", "loss": 0.4}, {"loss": 0.41}], 0.025),
+        ([{"loss": 0.4}, {"seen": "the other way", "loss": 0.42}, {"exchanged": "legs", "loss": 0.404}], 0.01),
+        ([{"apart": "shoulder", "loss": 0.4}, {"loss": 0.401}, {"seen": "the other way", "loss": 0.44}], 0.1),  # arms
+    ],
+)
+def test_swap_margin_is_of_the_longest_fits(limbs: list[dict], margin: float):
+    assert _swap_margin(_log(*limbs)) == pytest.approx(margin, abs=1e-4)

@@ -1,5 +1,5 @@
 """The fit, coarse to fine: size and trunk with headings, then gaits with the legs, then the rivals, then the winner,
-and that once more beside one whose limbs are where they are seen better, and one whose strides are alike.
+and that once more beside those with limbs where they are seen better, alike strides, or left and right exchanged.
 
 Every phase is one `optimise` of a batch of hypotheses; between phases they are ranked by loss on fixed draws and the
 best go on. All of it is deterministic by the seed, and a checkpoint within any phase resumes to the same bits.

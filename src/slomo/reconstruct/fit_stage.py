@@ -47,8 +47,8 @@ class FitConfig:
             left (one or two); gait_phases: phases tried of each gait.
         tilt_moving_deg, tilt_static_deg: s.d. of the given gravity for a camera that moved, and for one that did not.
         weight_*: of the evidence; 0 switches a term off. `facing` is for people only, `crossed` (legs) counts in the
-            last phase only; `view`, `keypoints`, `parts` and
-            `surface` are what networks and the user say, where they say anything.
+            last phase only; `view`, `keypoints`, `parts` and `surface` are what networks and the user say, where they
+            say anything.
     """
 
     skeleton: str = "auto"

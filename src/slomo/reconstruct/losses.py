@@ -295,6 +295,5 @@ def prior(s: State) -> Tensor:
 
 TERMS: dict[str, Term] = {
     "mask": mask, "reach": reach, "flow": flow, "stance": stance, "ground": ground, "limits": limits, "smooth": smooth,
-    "forward": forward, "balance": balance, "prior": prior, "facing": facing,
-    "crossed": crossed,
+    "forward": forward, "balance": balance, "prior": prior, "facing": facing, "crossed": crossed,
 }  # fmt: skip

@@ -8,9 +8,9 @@ from slomo.reconstruct.flow import inside, sample
 from slomo.reconstruct.instances import components, distance
 from slomo.reconstruct.instances_motion import SharedMotion, wider_than_a_leg
 from slomo.reconstruct.segment import grown
+from slomo.reconstruct.surroundings import frames_around
 
-_APART = (10, 20, 30, 45)  # frames before and after in which a place is looked for
-_GROWN = 1.15  # of the usual area in those frames, from which on something may have joined
+_GROWN = 1.15  # of the usual area in the frames around, from which on something may have joined
 _RARELY = 0.4  # of those frames in which a place is seen: what is the body's less often is not its own
 _MOSTLY = 0.7  # likewise, from which on it surely is
 _SEEN = 3  # frames in which a place must be seen again
@@ -45,7 +45,7 @@ def give_back_what_passes(layers: dict[int, np.ndarray], motion: SharedMotion) -
 def _passing(k: int, bodies: dict[int, np.ndarray], area: dict[int, float], motion: SharedMotion) -> np.ndarray:
     """(h, w) bool: what of body k is rarely seen as the body's around."""
     body = bodies[k] > 0.5
-    around = [o for d in _APART for o in (k - d, k + d) if o in bodies]
+    around = frames_around(k, bodies)
     if len(around) < _SEEN or area[k] < _GROWN * np.median([area[o] for o in around]):
         return np.zeros_like(body)
     own, seen = np.zeros(body.shape), np.zeros(body.shape)

@@ -65,13 +65,13 @@ def kept_apart(problem: Problem, x: Variables, guess: Guess) -> list[tuple[str, 
     reach = max(1, round(MOMENT / float((t[1:] - t[:-1]).median())))
     for name, links in _paired_links(kin):
         q, other = guess.q[0][:, links], kin.mirrored(guess.q)[0][:, links]
-        before, after = q[: -2 * reach], slice(2 * reach, None)
-        changed = (before - q[after]).abs().sum((1, 2)) - (before - other[after]).abs().sum((1, 2))
+        now, later = q[: -2 * reach], slice(2 * reach, None)
+        changed = (now - q[later]).abs().sum((1, 2)) - (now - other[later]).abs().sum((1, 2))
         if not len(changed) or changed.max() < CHANGED:
             continue
         at = int(changed.argmax()) + reach
-        for when, now in (("before", torch.arange(len(t)) < at), ("after", torch.arange(len(t)) >= at)):
-            new = torch.where(now[:, None, None], other, q)
+        for when, swapped in (("before", torch.arange(len(t)) < at), ("after", torch.arange(len(t)) >= at)):
+            new = torch.where(swapped[:, None, None], other, q)
             share = torch.linspace(0, 1, 2 * reach + 1)[:, None, None]
             new[at - reach : at + reach + 1] = torch.lerp(new[at - reach], new[at + reach], share)
             whole = guess.q.clone()

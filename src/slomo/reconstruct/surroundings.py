@@ -1,5 +1,6 @@
 """What a network takes in of the furniture around a subject is given back by its colours."""
 
+from collections.abc import Container
 from functools import partial
 
 import cv2
@@ -114,9 +115,7 @@ def _staying(gone: np.ndarray, k: int, bodies: dict[int, np.ndarray], flow: Flow
     """(H, W) bool: what of `gone` in frame k does not share the body's motion there, or, where the body is at rest
     then, in the nearest of the frames around in which it is not."""
     left = gone.copy()
-    for other in (k, *(k + d for gap in _APART for d in (gap, -gap))):
-        if other not in bodies or not bodies[other].any():
-            continue
+    for other in (k, *frames_around(k, bodies)):
         share = motion.share(other, motion.velocity(other, bodies[other]))
         if share is not None:
             there = sample(share, flow.chain(k, other)) if other != k else share
@@ -140,11 +139,16 @@ def _along(edge: np.ndarray, body: np.ndarray, where: np.ndarray) -> float:
     return float(edge[outline].mean()) if outline.any() else np.inf
 
 
+def frames_around(k: int, known: Container[int]) -> list[int]:
+    """The frames a third of a second to one and a half before and after frame k that are `known`, the nearest first."""
+    return [other for gap in _APART for other in (k + gap, k - gap) if other in known]
+
+
 def _lasting(piece: np.ndarray, k: int, bodies: dict[int, np.ndarray], flow: Flow) -> float:
     """Part of a piece of frame k that the frames around it take for the body, too; 1 where it is not seen elsewhere."""
     parts = []
-    for other in (k + d for gap in _APART for d in (gap, -gap)):
-        if other in bodies and bodies[other].any():
+    for other in frames_around(k, bodies):
+        if bodies[other].any():
             offset = flow.chain(k, other)
             seen = piece & inside(offset)
             if seen.sum() > 0.5 * piece.sum():
