@@ -66,6 +66,10 @@ def test_acts_are_what_they_are_called_and_begin_and_end_standing(animal, act):
         assert max(raised[2:]) == 0
     if act == "graze":
         assert high["nose"].min() < 0.3 < begins["nose"]
+    if act == "rear":
+        assert high["withers"].max() > 1.3
+        assert min(high[f"front_{s}_paw"].max() for s in ("left", "right")) > 0.7
+        assert max(np.ptp(high[f"hind_{s}_paw"]) for s in ("left", "right")) == 0
     assert min(z.min() for z in high.values()) > 0
 
 
@@ -123,7 +127,18 @@ def test_people_stand_still_and_over_their_soles(move):
     bent = ((knees - (hips + ankles) / 2) * ahead[:, None]).sum(-1)
     assert bent.min() > -0.01  # knees do not bend backwards
     smooth = np.abs(np.diff(m.nodes[:, 0, 2], 2)).max() * 30**2 * 1.7
-    assert smooth < 20  # m/s^2 of the pelvis, up and down
+    assert smooth < (30 if move == "jump" else 20)  # m/s^2 of the pelvis, up and down; landings are hard
+    high = m.nodes[..., 2]
+    hands = high[:, [at["left_wrist"], at["right_wrist"]]]
+    if move == "bend":
+        assert hands.min() < 0.35 < 0.4 < hands.max()
+    if move == "stretch":
+        assert hands.max(0).min() > high[:, at["head_top"]].min()
+    if move == "jump":
+        flies = ~m.contact.any(1)
+        assert 0.05 < balls[..., 2].max() - skeleton.sole < 0.2
+        assert flies.any()
+        assert (balls[flies, :, 2] > skeleton.sole).all()
 
 
 def test_who_is_on_the_spot_does_not_travel():

@@ -105,8 +105,8 @@ def add_commands(app: typer.Typer) -> None:
             str | None,
             typer.Option(
                 metavar="NAME",
-                help="walk, pace, trot, gallop, rotary, stand, reach, graze, sit, lie; "
-                "of a person walk, run, stand, squat, jack, wave. Default: walk.",
+                help="walk, pace, trot, gallop, rotary, stand, reach, graze, rear, sit, lie; "
+                "of a person walk, run, stand, squat, jack, wave, stretch, bend, jump. Default: walk.",
             ),
         ] = None,
         speed: Annotated[float | None, typer.Option(help="m/s; 0: the usual speed of the gait.")] = None,

@@ -79,9 +79,11 @@ def _animal(name: str, gait: str, t: Array, speed: float | None, turn: float, se
     motion = animate(p, gait, t, speed=speed, turn=turn, seed=seed)
     k = motion.keypoints
     nose, tail, withers, rump = (k[:, KEYPOINTS.index(n)] for n in ("nose", "tail_tip", "withers", "tail_base"))
+    high = gait == "rear"  # and the picture has to hold it
     target = (nose + tail) / 2
-    target[:, 2] = 0.55 * p.height
+    target[:, 2] = (0.9 if high else 0.55) * p.height
     length = float(np.linalg.norm(withers - rump, axis=1).mean())
+    whole = float(np.linalg.norm(nose - tail, axis=1).mean()) * (1.25 if high else 1.0)
 
     def skin() -> Skin:
         body = build_body(name, p, seed)
@@ -89,7 +91,7 @@ def _animal(name: str, gait: str, t: Array, speed: float | None, turn: float, se
 
     return Actor(
         "quadruped", KEYPOINTS, tuple(f"{f}_paw" for f in FEET), BONES, k, motion.contact, target,
-        float(np.linalg.norm(nose - tail, axis=1).mean()), length, p.height, 0.055 * length, 0.7 * length, skin,
+        whole, length, p.height, 0.055 * length, 0.7 * length, skin,
     )  # fmt: skip
 
 
@@ -99,8 +101,9 @@ def _person(_: str, move: str, t: Array, speed: float | None, turn: float, seed:
     height = float(np.random.default_rng([seed, 1]).uniform(*HEIGHT))
     motion = figure.pose(creature, move, t, height=height, speed=speed, turn=turn, seed=seed)
     k = height * motion.nodes
+    high = move in ("stretch", "jump")  # and the picture has to hold the hands
     target = (k.min(1) + k.max(1)) / 2
-    target[:, 2] = 0.5 * height
+    target[:, 2] = (0.62 if high else 0.5) * height
     names = skeleton.names
 
     def skin() -> Skin:
@@ -110,5 +113,5 @@ def _person(_: str, move: str, t: Array, speed: float | None, turn: float, seed:
     return Actor(
         "human", names, tuple(names[limb.contact] for limb in skeleton.limbs),
         tuple((names[skeleton.link[m]], n) for m, n in enumerate(names) if m), k, motion.contact, target,
-        1.4 * height, height, 0.6 * height, 0.012 * height, 0.15 * height, skin,
+        (1.8 if high else 1.4) * height, height, 0.6 * height, 0.012 * height, 0.15 * height, skin,
     )  # fmt: skip

@@ -126,8 +126,28 @@ def _graze(p: Proportions, t: Array, rng: np.random.Generator) -> Act:
     return a
 
 
+def _rear(p: Proportions, t: Array, rng: np.random.Generator) -> Act:
+    """On the hind legs, with the middle of the trunk about over them, and the front paws before the chest."""
+    w = _smooth(
+        _there_and_back(t, rng.uniform(0.2, 0.6), rng.uniform(0.6, 0.8), rng.uniform(0.2, 0.8), rng.uniform(0.3, 0.6))
+    )
+    a, half, pitch = _nothing(t), p.trunk / 2, rng.uniform(0.9, 1.2) * w
+    back = -0.8 * half * np.cos(pitch) * w
+    a.pitch[:] = -pitch
+    a.shift[:, 0] = half * (np.cos(pitch) - 1) + back
+    a.shift[:, 2] = half * np.sin(pitch) - 0.06 * w
+    a.look[:] = 0.7 * pitch
+    chest = p.trunk * np.stack([np.cos(pitch) - 1, np.sin(pitch)], 1) + np.stack([back, -0.06 * w], 1)
+    for k in range(2):
+        a.paws[:, k, 0] = chest[:, 0] + rng.uniform(0.1, 0.25) * w
+        a.paws[:, k, 2] = chest[:, 1] + rng.uniform(0.2, 0.35) * w
+        a.lean[:, k] = -rng.uniform(0.2, 0.9) * w
+        a.contact[:, k] = w == 0
+    return a
+
+
 ACTS: dict[str, Callable[[Proportions, Array, np.random.Generator], Act]] = {
-    "reach": _reach, "graze": _graze, "sit": _sit, "lie": _lie,
+    "reach": _reach, "graze": _graze, "sit": _sit, "lie": _lie, "rear": _rear,
 }  # fmt: skip
 FOLD = ("sit", "lie")  # not of a horse, which does it otherwise
 

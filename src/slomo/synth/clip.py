@@ -32,8 +32,8 @@ class Config:
     Attributes:
         animal: "dog", "cat", "horse" or "person"; its proportions and coat, or clothes, vary with the seed.
         gait: "walk", "pace", "trot", "gallop", "rotary" (a gallop whose front and hind leads differ), or on the spot
-            "stand", "reach" (lifts a front paw), "graze", "sit" and "lie" (down, and up again; not a horse); of a
-            person "walk", "run", "stand", "squat", "jack" or "wave".
+            "stand", "reach" (lifts a front paw), "graze", "rear", "sit" and "lie" (down, and up again; not a horse); of
+            a person "walk", "run", "stand", "squat", "jack", "wave", "stretch", "bend" or "jump".
         speed: m/s; 0 = the usual speed of the gait.
         turn: degrees/s, positive to the left.
         tempo: "steady", or played "faster" or "slower" (fourfold from one end to the other), or it "stops" after half

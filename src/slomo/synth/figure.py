@@ -32,10 +32,11 @@ class Stride:
 
 
 STRIDES = {"walk": Stride(0.52, 0.18, 0.27, 0.3, 0.03, 0.04), "run": Stride(0.36, 0.85, 0.41, 1.4, 0.10, 0.14)}
-ON_THE_SPOT = ("stand", "squat", "jack", "wave")
+ON_THE_SPOT = ("stand", "squat", "jack", "wave", "stretch", "bend", "jump")
 MOVES = (*STRIDES, *ON_THE_SPOT)
 _OVER_SOLE = 0.45  # of the way from the ankle to the ball of the foot: where the centre of mass is above
 _STRAIGHT = 0.997  # of the lengths of thigh and shank that a leg is stretched to at most
+_TYPICAL = 1.7  # m, by which those who jump fall as people of any height do
 _ROUNDS = 12  # of legs to the feet and of balance, in turn
 _SIDES = (("left", 1.0), ("right", -1.0))
 
@@ -135,12 +136,23 @@ def _strides(c: Creature, stride: Stride, t: Array, height: float, speed: float 
     return _Plan(ball, pitch, contact, heading, pelvis, q)
 
 
+def _eased(x: Array) -> Array:
+    """From 0 to 1 while x does, with no speed at either end."""
+    x = np.clip(x, 0, 1)
+    return x**2 * (3 - 2 * x)
+
+
+def _back_and_forth(x: Array) -> Array:
+    """0, 1 for a while, 0 for a while, and again: once in each unit of x."""
+    return np.clip(1.5 - np.abs((x % 1.0) - 0.5) * 4, 0, 1)
+
+
 def _on_the_spot(c: Creature, name: str, t: Array, rng: np.random.Generator) -> _Plan:
     q, at, u = _idle(c, t, rng), _number(c), rng.uniform
     T = len(t)
     pelvis, heading = np.zeros((T, 3)), np.full(T, u(-0.3, 0.3))
     apart, up, contact = np.full(T, u(0.045, 0.085)), np.zeros(T), np.ones((T, 2), bool)
-    raised = np.zeros((T, 2))  # of the arms, sideways
+    raised, beside = np.zeros((T, 2)), np.zeros(T)  # arms, sideways; the pelvis, to the left
     period = u(1.1, 2.2)
     if name == "squat":
         down = 0.5 - 0.5 * np.cos(2 * np.pi * (t / period / 1.4 + rng.random()))
@@ -163,6 +175,34 @@ def _on_the_spot(c: Creature, name: str, t: Array, rng: np.random.Generator) -> 
         raised[:, arm] = u(1.6, 2.6)
         q[:, at[f"{_SIDES[arm][0]}_shoulder"], 2] = _SIDES[arm][1] * u(0.6, 1.4)
         q[:, at[f"{_SIDES[arm][0]}_elbow"], 1] = -0.8 - 0.6 * np.sin(2 * np.pi * t * u(0.8, 1.6))
+    elif name == "stretch":  # arms up, then to one side and to the other
+        w = _eased(t / u(0.8, 1.4))
+        raised += u(2.0, 2.7) * w[:, None]
+        aside = u(0.2, 0.45) * w * np.sin(2 * np.pi * t / u(2.2, 3.2))
+        q[:, at["spine_mid"], 0] += aside
+        q[:, at["chest"], 0] += 0.4 * aside
+        beside = 0.12 * aside  # the hips go the other way
+    elif name == "bend":  # the hands to the ground
+        w = _eased(_back_and_forth(t / period / 1.3 + 0.3 * rng.random()))
+        lean, round_ = u(0.6, 1.0) * w, u(0.4, 0.8) * w
+        q[:, 0, 1] = lean
+        q[:, at["spine_mid"], 1] += 0.6 * round_
+        q[:, at["chest"], 1] += 0.4 * round_
+        pelvis[:, 2] = -u(0.02, 0.12) * w
+        for side, _ in _SIDES:
+            q[:, at[f"{side}_shoulder"], 1] -= lean + round_
+    elif name == "jump":
+        flight, deep = u(0.28, 0.42), u(0.08, 0.14)
+        push = 2 * deep / (G / _TYPICAL / 2 * flight)  # s, from rest to take-off, and from landing to rest
+        s = (t / (period + 0.5) + rng.random()) % 1.0 * (period + 0.5) - push - 0.4  # from take-off
+        up = np.where((s > 0) & (s < flight), G / _TYPICAL / 2 * s * (flight - s), 0.0)
+        contact &= ~((s > 0) & (s < flight))[:, None]
+        away = np.where(s < flight / 2, -s, s - flight)  # s, from the air, on either side of it
+        crouch = np.where(away < push, 1 - (1 - np.clip(away / push, 0, 1)) ** 2, _eased(1 - (away - push) / 0.4))
+        pelvis[:, 2] = -deep * crouch
+        q[:, at["spine_mid"], 1] += u(0.2, 0.5) * crouch
+        for side, _ in _SIDES:
+            q[:, at[f"{side}_shoulder"], 1] += u(0.3, 0.8) * crouch - u(0.8, 2.2) * (up > 0) * up / max(up.max(), 1e-9)
     for k, (side, y) in enumerate(_SIDES):
         q[:, at[f"{side}_shoulder"], 0] += y * (0.15 + raised[:, k])
         q[:, at[f"{side}_elbow"], 1] -= 0.25
@@ -173,7 +213,7 @@ def _on_the_spot(c: Creature, name: str, t: Array, rng: np.random.Generator) -> 
         ball[:, k, :2] = 0.06 * ahead + y * apart[:, None] * left
         ball[:, k, 2] = c.skeleton.sole + up
     sway = smooth_random(rng, t, 1.2, 2)
-    pelvis[:, :2] += 0.01 * sway[:, :1] * left
+    pelvis[:, :2] += (0.01 * sway[:, :1] + beside[:, None]) * left
     pitch = np.where(contact, 0.0, 0.35)
     return _Plan(ball, pitch, contact, heading, pelvis, q)
 
