@@ -18,9 +18,9 @@ from slomo.reconstruct.fields.config import FieldsConfig
 from slomo.reconstruct.fields.render import render
 from slomo.reconstruct.fields.terms import Fields
 from slomo.reconstruct.kinematics import Kinematics, rot
-from slomo.reconstruct.losses import State
 from slomo.reconstruct.observations import Observations
 from slomo.reconstruct.problem import Draw, Problem, Variables
+from slomo.reconstruct.state import State
 from slomo.reconstruct.trajectory import Guess, Trajectory
 from slomo.skeleton import load_skeleton
 from test_fit import _camera

@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from slomo.ground_path import whittaker
 from slomo.pinhole import Intrinsics
-from slomo.reconstruct import hypotheses, losses, silhouette
+from slomo.reconstruct import hypotheses, posture, silhouette
 from slomo.reconstruct.hypotheses import GaitHypothesis
 from slomo.reconstruct.kinematics import Kinematics, joint_rotation
 from slomo.reconstruct.silhouette import Outline
+from slomo.reconstruct.state import State
 from slomo.skeleton import list_skeletons, load_skeleton
 
 
@@ -72,11 +73,42 @@ def test_a_body_beside_its_feet_is_out_of_balance(kin: Kinematics):
     q[1, :, legs, 0] = 0.15  # all legs to the same side
     q[2, :, legs, 1] = -0.2  # all legs ahead
     body = _posed(kin, q, torch.eye(3))
-    state = cast(losses.State, SimpleNamespace(body=body, kin=kin, R_root=torch.eye(3).expand(3, 3, 3, 3)))
-    straight, leaning, back = losses.balance(state).tolist()
+    state = cast(State, SimpleNamespace(body=body, kin=kin, R_root=torch.eye(3).expand(3, 3, 3, 3)))
+    straight, leaning, back = posture.balance(state).tolist()
     assert straight == pytest.approx(0, abs=0.02)
     assert leaning > 1
     assert back > 1 if kin.skeleton.kind == "human" else back == pytest.approx(0, abs=1e-6)
+
+
+def test_people_hold_trunk_and_head_upright_and_who_bends_down_pays_no_more_than_so_much(kin: Kinematics):
+    """Whatever turns them: the root, the spine, or the neck alone; an animal's spine is free."""
+    names, human = kin.skeleton.names, kin.skeleton.kind == "human"
+    bends = [0.0, 0.2, 0.4, 1.2, 1.4]
+    q = torch.zeros(2 * len(bends), 2, kin.B, 3)
+    q[: len(bends), :, names.index("spine_mid"), 1] = torch.tensor(bends)[:, None]
+    q[len(bends) :, :, names.index("neck"), 1] = torch.tensor(bends)[:, None]
+    R = torch.eye(3).expand(len(q), 2, 3, 3)
+    body = kin.pose(kin.shape_variables(len(q)), torch.zeros(len(q), 2, 3), R, q)
+    free = SimpleNamespace(**{k: v for k, v in vars(kin).items() if k != "upright"}, upright=[])
+    cost = [posture.limits(cast(State, SimpleNamespace(body=body, kin=k, R_root=R, q=q))) for k in (kin, free)]
+    lean = (cost[0] - cost[1]).view(2, -1)
+    if not human:
+        assert lean.abs().max() == 0
+        return
+    assert [(names[a], names[b]) for a, b in kin.upright] == [("pelvis", "neck"), ("neck", "head_top")]
+    assert lean[:, 0].max() < 0.02  # the head is a little ahead of the neck at rest
+    assert (lean.diff() > 0).all()
+    assert (lean[:, 2] - lean[:, 0] > 5 * (lean[:, 4] - lean[:, 3])).all()
+
+
+def test_a_person_is_built_upright_and_an_animal_as_it_likes(kin: Kinematics):
+    shape = kin.shape_variables(1)
+    shape["shift"][..., 0] = 1.0
+    ahead = (kin.offsets(shape) - kin.offsets(kin.shape_variables(1)))[0, :, 0]
+    spine, limb = (ahead[kin.skeleton.names.index(n)] for n in ("neck", kin.skeleton.limbs[0].name + "_knee"
+                   if kin.skeleton.kind == "human" else "front_left_elbow"))  # fmt: skip
+    assert limb == pytest.approx(0.05, rel=1e-3)
+    assert spine == pytest.approx(0.015 if kin.skeleton.kind == "human" else 0.05, rel=1e-3)
 
 
 def _random_outline(generator: torch.Generator) -> list[torch.Tensor]:

@@ -8,7 +8,7 @@ import torch
 
 from slomo.pinhole import Intrinsics
 from slomo.prior.labels import BINS
-from slomo.reconstruct import fit, hypotheses, losses, pose_track, silhouette
+from slomo.reconstruct import fit, hypotheses, pose_track, posture, silhouette
 from slomo.reconstruct.evidence import gather
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.observations import observe
@@ -122,7 +122,7 @@ def test_only_a_back_costs(raising):
     x = problem.variables(3, torch.Generator().manual_seed(0))
     draw = problem.draw(4, 20, torch.Generator().manual_seed(0))
     state = problem.state(x, hypotheses.placed(problem.kin, root, yaw), draw, stance_weight=0.0)
-    assert losses.facing(state).tolist() == pytest.approx([0, 0, 1], abs=1e-4)
+    assert posture.facing(state).tolist() == pytest.approx([0, 0, 1], abs=1e-4)
 
 
 def test_who_is_turned_around_is_the_reflection_in_depth(raising):

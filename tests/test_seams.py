@@ -46,12 +46,17 @@ def settled(monkeypatch):
     true = [cut(motion(), *w) for w in WHERE]
 
     def rank(problem, x, guess: Guess, *, draws: int) -> torch.Tensor:
-        return (guess.q - true[problem.number].q).abs().mean((1, 2, 3))
+        own = true[problem.number]
+        return (guess.q - own.q).abs().mean((1, 2, 3)) + 1 - torch.cos(guess.yaw - own.yaw).mean(1)
 
     def problem_of(n: int) -> SimpleNamespace:
         t = torch.arange(*WHERE[n]) / FPS
         path = Trajectory(t, KIN.B, joint_hz=4, root_hz=2, width=8)
-        return SimpleNamespace(number=n, kin=KIN, path=path, obs=SimpleNamespace(t=t))
+        camera = torch.tensor([12.0, 1.0, 0.6])
+        return SimpleNamespace(
+            number=n, kin=KIN, path=path, obs=SimpleNamespace(t=t),
+            cameras=lambda tilt, at: (None, camera.expand(1, len(at), 3)),
+        )  # fmt: skip
 
     def call(guesses: list[Guess]) -> tuple[list[Guess], list[dict]]:
         runs = []
@@ -96,3 +101,19 @@ def test_a_chunk_that_is_wrong_all_through_is_exchanged_all_through(settled):
     found, log = call(wrong)
     assert log == [{"limbs": "hind", "exchanged_s": [2.0, round(74 / FPS, 3)], "chunk": 2}]
     torch.testing.assert_close(found[1].q, true[1].q)
+
+
+@pytest.mark.parametrize("wrong", [0, 1])
+def test_a_chunk_that_faces_the_other_way_is_turned_around(settled, wrong: int):
+    """The legs go with it: seen from the front, what was the left one on the back is the right one."""
+    call, true = settled
+    guesses = [cut(motion(), *w) for w in WHERE]
+    camera = torch.tensor([12.0, 1.0])
+    away = guesses[wrong].position[..., :2] - camera
+    guesses[wrong].yaw[:] = 2 * torch.atan2(away[..., 1], away[..., 0]) + np.pi - guesses[wrong].yaw
+    guesses[wrong].q[:] = KIN.mirrored(guesses[wrong].q)
+    found, log = call(guesses)
+    assert log == [{"turned_around": True, "chunk": wrong + 1}]
+    for f, g in zip(found, true, strict=True):
+        torch.testing.assert_close(f.q, g.q)
+        torch.testing.assert_close(torch.cos(f.yaw - g.yaw), torch.ones_like(g.yaw))

@@ -15,7 +15,7 @@ import torch
 from slomo.prior.labels import BINS
 from slomo.reconstruct import silhouette
 from slomo.reconstruct.evidence import Evidence
-from slomo.reconstruct.losses import State, Term
+from slomo.reconstruct.state import State, Term
 
 Tensor = torch.Tensor
 

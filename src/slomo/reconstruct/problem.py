@@ -10,6 +10,7 @@ from slomo.reconstruct import losses, silhouette
 from slomo.reconstruct.evidence import Evidence
 from slomo.reconstruct.kinematics import Kinematics, rot
 from slomo.reconstruct.observations import Observations
+from slomo.reconstruct.state import State, Term
 from slomo.reconstruct.trajectory import Guess, Trajectory
 
 Tensor = torch.Tensor
@@ -41,7 +42,7 @@ class Problem:
     path: Trajectory
     weights: Mapping[str, float]
     tilt_spread: float
-    terms: Mapping[str, losses.Term] = field(default_factory=lambda: losses.TERMS)
+    terms: Mapping[str, Term] = field(default_factory=lambda: losses.TERMS)
     said: Evidence | None = None
 
     def variables(self, H: int, generator: torch.Generator) -> Variables:
@@ -72,7 +73,7 @@ class Problem:
         outside = _found(self.obs.draw_out, seen, r[1]).clamp(max=n)
         return Draw(seen, torch.cat([inside, outside], 1), half)
 
-    def state(self, x: Variables, guess: Guess, draw: Draw, *, stance_weight: float) -> losses.State:
+    def state(self, x: Variables, guess: Guess, draw: Draw, *, stance_weight: float) -> State:
         obs, kin = self.obs, self.kin
         shape = {k.removeprefix("shape."): v for k, v in x.items() if k.startswith("shape.")}
         length = shape["log_length"].exp()
@@ -88,7 +89,7 @@ class Problem:
         near, least, nearest = silhouette.nearest(sd, losses.SOFT_PX)
         hypothetical = guess.stance[:, obs.at][:, :-1]
         stance = torch.where(hypothetical < 0, hypothetical, stance_weight * hypothetical)
-        return losses.State(
+        return State(
             obs=obs, kin=kin, body=body, q=q, R_root=R_root, shape=shape, tilt=x["tilt"], R_cam=R_cam, centre=centre,
             seen=draw.seen, u=u, v=v, pixel=draw.pixel, inside=draw.inside, out=out, sd=sd, h=h, near=near, least=least,
             nearest=nearest, ends=(a, b), stance=stance, x=x,

@@ -13,8 +13,8 @@ import torch
 
 from slomo.reconstruct.hypotheses import as_guess, exchanged, leg_pairs
 from slomo.reconstruct.kinematics import Kinematics
-from slomo.reconstruct.losses import State
 from slomo.reconstruct.problem import Problem, Variables, rank
+from slomo.reconstruct.state import State
 from slomo.reconstruct.trajectory import Guess
 
 BELIEVED = 1 / 3  # share of their weight that networks keep where fitted motions are compared

@@ -6,7 +6,7 @@ import torch
 
 from slomo.reconstruct.fields.canonical import Capsules, density
 from slomo.reconstruct.fields.config import FieldsConfig
-from slomo.reconstruct.losses import State
+from slomo.reconstruct.state import State
 
 Tensor = torch.Tensor
 

@@ -8,8 +8,8 @@ from slomo.reconstruct.fields import networks, rays, skinning
 from slomo.reconstruct.fields.canonical import Rest, density, rest
 from slomo.reconstruct.fields.config import FieldsConfig
 from slomo.reconstruct.fields.rays import Rays
-from slomo.reconstruct.losses import State
 from slomo.reconstruct.silhouette import project
+from slomo.reconstruct.state import State
 
 Tensor = torch.Tensor
 

@@ -9,8 +9,9 @@ from slomo.reconstruct.fields.config import FieldsConfig
 from slomo.reconstruct.fields.networks import Variables
 from slomo.reconstruct.fields.render import Rendered, render
 from slomo.reconstruct.kinematics import Kinematics
-from slomo.reconstruct.losses import FLOW_PX, State, Term
+from slomo.reconstruct.losses import FLOW_PX
 from slomo.reconstruct.observations import Observations
+from slomo.reconstruct.state import State, Term
 
 Tensor = torch.Tensor
 

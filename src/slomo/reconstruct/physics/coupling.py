@@ -9,13 +9,13 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
-from slomo.reconstruct.losses import State, Term
 from slomo.reconstruct.outcome import own_length, stood
 from slomo.reconstruct.physics.learn import FOOT_WEIGHT, Learner, PhysicsConfig, Simulated, Variables
 from slomo.reconstruct.physics.model import Body, Mechanics, build
 from slomo.reconstruct.physics.windows import Kinematic
 from slomo.reconstruct.problem import Problem
 from slomo.reconstruct.problem import Variables as FitVariables
+from slomo.reconstruct.state import State, Term
 from slomo.reconstruct.trajectory import Guess
 
 Array = np.ndarray
