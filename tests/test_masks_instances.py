@@ -218,8 +218,8 @@ def test_what_was_the_subjects_of_late_is_trusted_to_be(monkeypatch):
     trunk[40:60, 50:80], foot[70:80, 50:60], crate[40:60, 90:110] = True, True, True
     nothing, asked = np.zeros((H, W), bool), {}
 
-    def look_at(self, t, carried, others, trusted):
-        asked[t] = trusted
+    def look_at(self, t, carried, others, own):
+        asked[t] = own
         return trunk | (foot if t < 10 else nothing) | (crate if t in (5, 20, 21, 22, 23, 24) else nothing), nothing
 
     monkeypatch.setattr(_Track, "_look_at", look_at)
@@ -228,7 +228,7 @@ def test_what_was_the_subjects_of_late_is_trusted_to_be(monkeypatch):
     track.follow(list(range(40)), lambda: None)
     assert all(asked[t][trunk].all() for t in range(40))
     assert [bool(asked[t][foot].all()) for t in (1, 9, 12, 18, 30)] == [True, True, True, True, False]
-    assert [bool(asked[t][crate].any()) for t in (5, 6, 7, 25, 26)] == [False, True, False, True, False]  # flow's word
+    assert not any(asked[t][crate].any() for t in range(40))  # a few frames are nothing
 
 
 def test_furniture_that_did_not_stand_out_for_a_while_is_still_there_when_it_is_touched():
@@ -312,6 +312,18 @@ def test_pieces_stay_and_strangers_do_not():
     mine, theirs, _ = tell_apart(merged, subject, np.roll(subject, 60, axis=1), lambda piece: False)
     assert mine[60, 61:115].all()
     assert theirs[60, 125:149].all()
+
+
+def test_feet_hang_from_the_body_by_legs_that_are_missed():
+    """Not seen now, but its own of late; what nothing of its own leads to has come away."""
+    trunk, legs, feet, box = (np.zeros((H, W), bool) for _ in range(4))
+    trunk[10:50, 60:90], legs[50:80, 60:75], feet[80:90, 60:80], box[80:90, 120:140] = True, True, True, True
+    carried, nothing = trunk | feet | box, np.zeros((H, W), bool)
+    mine, theirs, _ = tell_apart(trunk | feet | box, carried, nothing, lambda piece: False, own=trunk | legs | feet)
+    np.testing.assert_array_equal(mine, trunk | feet)
+    np.testing.assert_array_equal(theirs, box)
+    mine, _, _ = tell_apart(trunk | feet, carried, nothing, lambda piece: False)
+    assert not mine[feet].any()
 
 
 def test_shared_motion():

@@ -46,9 +46,9 @@ class FitConfig:
         candidates: hypotheses that are fitted in the gait phase, at least one without a gait for each heading that is
             left (one or two); gait_phases: phases tried of each gait.
         tilt_moving_deg, tilt_static_deg: s.d. of the given gravity for a camera that moved, and for one that did not.
-        weight_*: of the evidence; 0 switches a term off. `facing` is for people only, `crossed` (legs) counts in the
-            last phase only; `view`, `keypoints`, `parts` and `surface` are what networks and the user say, where they
-            say anything.
+        weight_*: of the evidence; 0 switches a term off. `facing` and `upright` are for people only, `upright` and
+            `crossed` (legs) count in the last phase only; `view`, `keypoints`, `parts` and `surface` are what networks
+            and the user say, where they say anything.
     """
 
     skeleton: str = "auto"
@@ -77,6 +77,7 @@ class FitConfig:
     weight_prior: float = 0.05
     weight_facing: float = 0.012
     weight_crossed: float = 0.03
+    weight_upright: float = 0.005
     weight_view: float = 0.05
     weight_keypoints: float = 0.5
     weight_parts: float = 0.25
@@ -138,7 +139,7 @@ def prepare(inputs: Inputs, config: FitConfig) -> Prepared:
     weights = config.weights()
     said = _evidence(inputs, obs, skeleton, weights)
     if skeleton.kind != "human":
-        weights["facing"] = 0.0
+        weights["facing"] = weights["upright"] = 0.0
     terms = {**losses.TERMS, **(evidence_terms.terms(said) if said else {})}
     problem = Problem(obs, kin, path, weights, float(spread), terms, said)
     metres = config.length_m or skeleton.typical_length

@@ -117,18 +117,20 @@ def tell_apart(
     alike: Callable[[np.ndarray], bool],
     share: np.ndarray | None = None,
     usual: float = 0.0,
+    own: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Whose is what is found in a frame, from where flow has carried the subject and the others.
 
     A piece near the subject that was part of it is still; one that has come away from it further than a post is wide,
-    and one that comes from elsewhere, is another's. What two have merged into goes to whom it was, and what nobody was
-    to whose motion it has, or else to the nearer.
+    with nothing between them that was its own of late, and one that comes from elsewhere, is another's. What two have
+    merged into goes to whom it was, and what nobody was to whose motion it has, or else to the nearer.
 
     Args:
         found: (H, W) bool.  subject, others: (H, W) bool, carried to this frame.
         alike: says of a piece nobody has seen before whether it looks like the subject.
         share: (H, W) how much of the subject's motion each pixel has, where that is known.
         usual: px, area of the subject when nothing hides it.
+        own: (H, W) bool, what was the subject's of late: feet still hang from it by legs that are not seen for a while.
 
     Returns:
         (H, W) bool of the subject, of the others, and of what is surely the others': not merely nearer to them.
@@ -143,6 +145,7 @@ def tell_apart(
     if main < 0 or shared[main][0] == 0:
         return mine, found, found
     to_main = distance(pieces[main])
+    hangs = pieces[main] if own is None else component_at(found | own, pieces[main])
     nearer = None
     for i, piece in enumerate(pieces):
         s, o, area = shared[i]
@@ -161,7 +164,7 @@ def tell_apart(
             moves_along = share is not None and np.median(share[piece]) > 0.5
             known = s > 0.3 * area
             gap = to_main[piece].min()
-            close = gap < (_APART if known or moves_along else _NEW) * size
+            close = gap < (_APART if known or moves_along else _NEW) * size or (known and (hangs & piece).any())
             same = i == main or (close and (known or area < _LIMB * usual or alike(piece)))
             (mine if same else theirs)[piece] = True
             if not same and area > _LIMB * usual:

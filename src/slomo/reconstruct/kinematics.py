@@ -17,9 +17,6 @@ Tensor = torch.Tensor
 # where a limb turns, the silhouette where its flesh ends.
 NODE_SPREAD = 0.16  # s.d. of the log length of one offset, beside its group's
 SHIFT_SPREAD = 0.05  # s.d. of the place of a node, body lengths
-# Factor of that for what hangs from a person's trunk, forward and back: a spine, a neck and a head 5 % ahead each are
-# a body that leans, which from the front and from the back nothing denies.
-STRAIGHT = 0.3
 RADIUS_SPREAD = 0.18  # s.d. of the log radius of one end of a capsule
 FLESH_SPREAD = 0.03  # s.d. of the place of one end of a capsule against its node, body lengths
 GIRTH_SPREAD = 0.15  # s.d. of the log of all radii together
@@ -75,8 +72,9 @@ def joint_rotation(q: Tensor) -> Tensor:
 
 class Kinematics:
     """A skeleton's tables as tensors, its mean `leg` length (hip or shoulder over the foot at rest, body lengths), the
-    numbers of the left and right limbs of its `pairs` (P, 2), the nodes at both ends of what it holds `upright` (a
-    person's trunk, and neck and head), and its forward kinematics."""
+    numbers of the left and right limbs of its `pairs` (P, 2), the shape variables of nodes that hang from its trunk
+    (`of_trunk`), the nodes at both ends of what it holds `upright` (a person's trunk, and neck and head; nothing of an
+    animal), and its forward kinematics."""
 
     def __init__(self, skeleton: Skeleton):
         self.skeleton = skeleton
@@ -95,12 +93,10 @@ class Kinematics:
         self.node_variable = torch.unique(first, return_inverse=True)[1]
         self.flip = torch.where(first < torch.arange(len(first)), -1.0, 1.0)
         self.median = (self.mirror == torch.arange(len(first))).float()
-        ahead, aside = torch.ones_like(self.flip), self.flip * (1 - self.median)
-        self.upright: list[tuple[int, int]] = []
-        if skeleton.kind == "human":
-            ahead = torch.where(self.median[self.link] > 0, STRAIGHT, 1.0)
-            self.upright = self._upright()
-        self.shift_spread = SHIFT_SPREAD * torch.stack([ahead, aside, torch.ones_like(ahead)], -1)
+        one = torch.ones_like(self.flip)
+        self.shift_spread = SHIFT_SPREAD * torch.stack([one, self.flip * (1 - self.median), one], -1)
+        self.of_trunk = self.node_variable[(self.median[self.link] > 0) & (torch.arange(len(first)) > 0)].unique()
+        self.upright = self._upright() if skeleton.kind == "human" else []
         c_first = torch.minimum(i(skeleton.capsule_mirror), torch.arange(len(self.c_link)))
         self.flesh_variable = torch.unique(c_first, return_inverse=True)[1]
         c_number = torch.arange(len(c_first))

@@ -2,29 +2,38 @@
 
 import torch
 
+from slomo.reconstruct.kinematics import SHIFT_SPREAD
 from slomo.reconstruct.state import State
 
 Tensor = torch.Tensor
 
 SWING = 5.0  # accelerations of a gait's nodes in units of speed squared over body length
+STRAIGHT = 0.015  # s.d. of how far ahead of the other a joint of a person's trunk lies, body lengths
 OVER_SOLE = 0.4  # of the way from the ankle to the ball of the foot: where the centre of mass of a person is above
 
 
 def limits(s: State) -> Tensor:
-    """Joint angles within their anatomical ranges, and near rest by their prior; root pitch and roll small, a person's
-    trunk and head upright: robust, for who bends down is seen to."""
+    """Joint angles within their anatomical ranges, and near rest by their prior; root pitch and roll small."""
     q, kin = s.q[:, :, 1:], s.kin
     over = (q - kin.upper[1:]).clamp(min=0) + (kin.lower[1:] - q).clamp(min=0)
     # Sideways and twisting rotation is what a silhouette cannot deny, hence its larger weight.
     rest = (q / kin.sigma[1:]).square() * torch.tensor([5.0, 1.0, 5.0])
     up = s.R_root[..., 2, 0].square() / 0.15**2 + s.R_root[..., 2, 1].square() / 0.08**2
-    lean = torch.zeros_like(up)
+    return 40 * over.square().sum(-1).mean((1, 2)) + 0.3 * rest.mean((1, 2, 3)) + 0.15 * up.mean(1)
+
+
+def upright(s: State) -> Tensor:
+    """People hold trunk and head upright, in units of 0.15 rad, robust, for who bends down is seen to; and their spine,
+    neck, head and hips are not built ahead of each other by more than `STRAIGHT`. From the front and the back nothing
+    else denies that a body leans."""
+    kin = s.kin
+    lean = torch.zeros_like(s.R_root[..., 2, 0])
     for a, b in kin.upright:
         line = s.body.nodes[:, :, b] - s.body.nodes[:, :, a]
         e = line[..., :2].square().sum(-1) / line.square().sum(-1) / 0.15**2
         lean = lean + e / (1 + 0.1 * e)
-    near = 0.3 * rest.mean((1, 2, 3)) + 0.15 * up.mean(1) + 0.05 * lean.mean(1)
-    return 40 * over.square().sum(-1).mean((1, 2)) + near
+    ahead = s.shape["shift"][:, kin.of_trunk, 0] * SHIFT_SPREAD / STRAIGHT
+    return lean.mean(1) + 0.25 * ahead.square().sum(1)
 
 
 def crossed(s: State) -> Tensor:

@@ -19,7 +19,7 @@ _SURELY_ALIKE = 0.9  # the same of a piece that does not move as the subject did
 _LASTING = 30  # frames in which it was seen, over which the subject's usual size is taken
 _HELD = 0.4  # probability over time: thin limbs are missed more often than furniture is taken
 _MEMORY = 0.93  # of who is who, from one frame to the next
-_TRUSTED = 0.5  # of the last half second in which what stands was found to be the subject's: it still is
+_TRUSTED = 0.5  # of the last half second in which what looks the same was found to be the subject's: it still is
 
 
 @dataclass(frozen=True)
@@ -191,22 +191,20 @@ class _Track:
                 resting &= same
                 trust = sample(trust, offset) * same
             known = others | resting
-            calm = self.motion.calm(t)
-            # A foot that stands and is missed for a while is still the subject's when it stands out again.
-            subject, others = self._look_at(t, subject, known, subject | (calm & (trust > _TRUSTED)))
+            subject, others = self._look_at(t, subject, known, trust > _TRUSTED)
             if t == previous:
                 trust = np.maximum(trust, subject)
             else:
                 trust = subject + _MEMORY ** abs(t - previous) * (trust - subject)
             # Furniture that does not stand out for a while is still there when the subject touches it.
-            resting = known & ~others & ~grown(subject, 0.03) & calm
+            resting = known & ~others & ~grown(subject, 0.03) & self.motion.calm(t)
             tick()
 
     def _look_at(
-        self, t: int, carried: np.ndarray, others: np.ndarray, trusted: np.ndarray
+        self, t: int, carried: np.ndarray, others: np.ndarray, own: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Who is who in frame t, from where flow has carried them to, and from what is `trusted` to be the subject's:
-        that, and a foot that stands and was its own of late; writes the layer."""
+        """Who is who in frame t, from where flow has carried them to, and from what was the subject's `own` of late: a
+        foot that stands and is missed for a while is still its foot when it stands out again. Writes the layer."""
         frame = self.frames[t]
         if carried.sum() < 0.04 * self._usual()[2]:
             subject, others, seen = self._search(t)
@@ -216,10 +214,10 @@ class _Track:
             alike = lambda piece: self._look.likeness(frame, piece) > _ALIKE  # noqa: E731
             found = seen > 0.5
             share = self.motion.share(t, self.motion.velocity(t, carried & found))
+            trusted, usual = carried | (own & self.motion.calm(t)), self._usual()[2]
             astray = foreign(found, carried, share, known=trusted & ~others)
-            subject, others, sure = tell_apart(
-                found & ~astray, carried & ~astray, others, alike, share, self._usual()[2]
-            )
+            before = carried & ~astray
+            subject, others, sure = tell_apart(found & ~astray, before, others, alike, share, usual, own & ~others)
             others, sure = others | astray, sure | astray
             if subject.any() and self._look.likeness(frame, subject) < 0.6:
                 subject, others, sure = np.zeros_like(subject), others | subject, sure | subject

@@ -34,15 +34,16 @@ def doubting(problem: Problem) -> Problem:
     return replace(problem, weights={k: w * (BELIEVED if k in sided else 1) for k, w in problem.weights.items()})
 
 
-def unsided(problem: Problem) -> Problem:
-    """The problem while nobody knows whose leg is whose: legs may cross, which shows where they are seen."""
-    return replace(problem, weights={**problem.weights, "crossed": 0.0})
+def unsettled(problem: Problem) -> Problem:
+    """The problem before its last phase: legs may cross while nobody knows whose is whose, which shows where they are
+    seen; and a body that leans may find a way to a motion that an upright one does not."""
+    return replace(problem, weights={**problem.weights, "crossed": 0.0, "upright": 0.0})
 
 
 def exchanged_pairs(problem: Problem, x: Variables, guess: Guess) -> list[tuple[str, Variables, Guess]]:
     """The motion with one pair of legs exchanged, by the pair's name, wherever that is another motion and hardly
     worse; and where a pair is crossed, with the two where they are seen, uncrossed."""
-    judge, kin = doubting(unsided(problem)), problem.kin
+    judge, kin = doubting(unsettled(problem)), problem.kin
     pairs, state, limit = leg_pairs(kin), _posed(problem, x, guess), (1 + OPEN) * float(rank(judge, x, guess)[0])
     out = []
     for (name, links, _), by in zip(pairs, kin.crossing(state.body, state.R_root).mean((0, 1)).tolist(), strict=True):

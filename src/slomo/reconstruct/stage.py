@@ -14,7 +14,7 @@ from slomo.reconstruct.video import decode
 from slomo.stage import Artifact, Inputs, Progress
 
 DECODE_VERSION = 2
-MASKS_VERSION = 21
+MASKS_VERSION = 22
 CAMERA_VERSION = 8
 QUALITIES = ("draft", "normal", "high")
 
