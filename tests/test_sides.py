@@ -70,12 +70,14 @@ def test_crossed_legs_are_uncrossed_where_they_are_seen(degrees: float):
         assert (now[:, [1, 0]] - feet).norm(dim=-1).max() < 1.1 * hips
 
 
-def test_legs_may_cross_until_sides_are_settled():
+def test_legs_may_cross_and_people_lean_until_the_last_phase():
     values = {}
     for degrees in (-20.0, 0.0, 20.0):
         problem, _, x, guess = spread(degrees)
         problem = replace(problem, weights={"crossed": 1.0})
-        values[degrees] = [float(rank(p, x, guess)[0]) for p in (problem, sides.unsided(problem))]
+        leaning = sides.unsettled(replace(problem, weights={"upright": 1.0}))
+        assert float(rank(leaning, x, guess)[0]) == 0
+        values[degrees] = [float(rank(p, x, guess)[0]) for p in (problem, sides.unsettled(problem))]
     assert values[-20.0][0] > 1
     assert values[0.0][0] == values[20.0][0] == 0
     assert all(free == 0 for _, free in values.values())
