@@ -56,7 +56,7 @@ def fit(
     run, start, adam_state = restore(progress.load(), generator)
     if run is None:
         run = starts.start(problem, root, generator)
-    total, last = total_cost(effort), max(n for n, s in enumerate(effort.schedules) if s.iterations)
+    total = total_cost(effort)
     while True:
         schedule = effort.schedules[run.phase]
         done = sum(s.iterations * _cost(s) for s in effort.schedules[: run.phase])
@@ -67,7 +67,7 @@ def fit(
             if progress.checkpoint_due():
                 progress.save(checkpoint(run, i, optimiser, generator))
 
-        at = problem if run.phase >= last else sides.unsettled(problem)
+        at = problem if run.phase == len(PHASES) - 1 else sides.unsettled(problem)
         run.x = optimise(at, run.x, run.guess, schedule, generator, start=start, adam_state=adam_state, each=each)
         start, adam_state = 0, None
         judge = at if run.phase < FINAL or _front_or_back(run) else sides.doubting(at)

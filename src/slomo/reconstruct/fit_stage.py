@@ -47,7 +47,7 @@ class FitConfig:
             left (one or two); gait_phases: phases tried of each gait.
         tilt_moving_deg, tilt_static_deg: s.d. of the given gravity for a camera that moved, and for one that did not.
         weight_*: of the evidence; 0 switches a term off. `facing` and `upright` are for people only, `upright` and
-            `crossed` (legs) count in the last phase only; `view`, `keypoints`, `parts` and `surface` are what networks
+            `crossed` (legs) count in the phase limbs only; `view`, `keypoints`, `parts` and `surface` are what networks
             and the user say, where they say anything.
     """
 
