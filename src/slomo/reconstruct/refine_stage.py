@@ -22,7 +22,7 @@ from slomo.reconstruct.run import Run, from_arrays
 from slomo.reconstruct.verdict import Facts, checks, verdict
 from slomo.stage import Artifact, Inputs, Progress
 
-REFINE_VERSION = 12
+REFINE_VERSION = 13
 TREMBLES = 0.1  # degrees of a camera's rotation, of which the user is told
 
 
