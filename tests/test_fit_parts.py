@@ -13,7 +13,7 @@ from slomo.ground_path import whittaker
 from slomo.pinhole import Intrinsics
 from slomo.reconstruct import hypotheses, posture, silhouette
 from slomo.reconstruct.hypotheses import GaitHypothesis
-from slomo.reconstruct.kinematics import SHIFT_SPREAD, Kinematics, joint_rotation
+from slomo.reconstruct.kinematics import SHIFT_SPREAD, Kinematics, joint_rotation, rot
 from slomo.reconstruct.silhouette import Outline
 from slomo.reconstruct.state import State
 from slomo.skeleton import list_skeletons, load_skeleton
@@ -89,6 +89,14 @@ def _upright(kin: Kinematics, q: torch.Tensor, shape: dict[str, torch.Tensor]) -
     R = torch.eye(3).expand(*q.shape[:2], 3, 3)
     body = kin.pose(shape, torch.zeros(*q.shape[:2], 3), R, q)
     return posture.upright(cast(State, SimpleNamespace(body=body, kin=kin, R_root=R, q=q, shape=shape)))
+
+
+def test_who_rears_is_seen_to_and_pays_little_more_than_who_tilts(kin: Kinematics):
+    q, pitch = torch.zeros(3, 2, kin.B, 3), torch.tensor([0.0, 0.3, 1.0])
+    R = rot(1, -pitch)[:, None].expand(3, 2, 3, 3)
+    cost = posture.limits(cast(State, SimpleNamespace(kin=kin, R_root=R, q=q)))
+    level, tilted, rears = (cost - cost[0]).tolist()
+    assert level == 0 < tilted < rears < 5 * tilted  # its square is eight times as large
 
 
 def test_people_hold_trunk_and_head_upright_and_who_bends_down_pays_no_more_than_so_much(person: Kinematics):
