@@ -58,14 +58,16 @@ def settled(monkeypatch):
             cameras=lambda tilt, at: (None, camera.expand(1, len(at), 3)),
         )  # fmt: skip
 
-    def call(guesses: list[Guess]) -> tuple[list[Guess], list[dict]]:
-        runs = []
+    def call(guesses: list[Guess], *, facing: bool = False) -> tuple[list[Guess], list[dict]]:
+        runs, log = [], []
         for n, guess in enumerate(guesses):
             shape = {f"shape.{k}": v for k, v in KIN.shape_variables(1).items()}
             moves = problem_of(n).path.variables(1, torch.Generator().manual_seed(0))
             runs.append(Run(4, shape | moves | {"tilt": torch.zeros(1, 2)}, guess, [{}]))
-        out, log = seams.settle(problem_of, runs, WHERE)  # type: ignore[arg-type]
-        return [r.guess for r in out], log
+        if facing:
+            runs, log = seams.one_way(problem_of, [problem_of(n).path for n in range(2)], runs, WHERE)  # type: ignore
+        out, exchanged = seams.settle(problem_of, runs, WHERE)  # type: ignore[arg-type]
+        return [r.guess for r in out], log + exchanged
 
     monkeypatch.setattr(seams, "rank", rank)
     return call, true
@@ -73,7 +75,7 @@ def settled(monkeypatch):
 
 def test_chunks_that_agree_stay_as_they_are(settled):
     call, true = settled
-    found, log = call([cut(motion(), *w) for w in WHERE])
+    found, log = call([cut(motion(), *w) for w in WHERE], facing=True)
     assert log == []
     for f, g in zip(found, true, strict=True):
         torch.testing.assert_close(f.q, g.q)
@@ -112,7 +114,7 @@ def test_a_chunk_that_faces_the_other_way_is_turned_around(settled, wrong: int):
     away = guesses[wrong].position[..., :2] - camera
     guesses[wrong].yaw[:] = 2 * torch.atan2(away[..., 1], away[..., 0]) + np.pi - guesses[wrong].yaw
     guesses[wrong].q[:] = KIN.mirrored(guesses[wrong].q)
-    found, log = call(guesses)
+    found, log = call(guesses, facing=True)
     assert log == [{"turned_around": True, "chunk": wrong + 1}]
     for f, g in zip(found, true, strict=True):
         torch.testing.assert_close(f.q, g.q)

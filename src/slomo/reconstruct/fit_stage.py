@@ -47,7 +47,7 @@ class FitConfig:
             left (one or two); gait_phases: phases tried of each gait.
         tilt_moving_deg, tilt_static_deg: s.d. of the given gravity for a camera that moved, and for one that did not.
         weight_*: of the evidence; 0 switches a term off. `facing` and `upright` are for people only, `upright` and
-            `crossed` (legs) count in the phase limbs only; `view`, `keypoints`, `parts` and `surface` are what networks
+            `crossed` (legs) count from the phase limbs on; `view`, `keypoints`, `parts` and `surface` are what networks
             and the user say, where they say anything.
     """
 
@@ -189,10 +189,13 @@ def _long(
     runs = chunks.finished(progress)
     while len(runs) < len(where):
         runs.append(_search(part(len(runs)), config, chunks.ChunkProgress(progress, runs, len(where))))
-    runs, exchanged = seams.settle(lambda n: part(n).problem, runs, where)
     paths = [_path(made.problem.obs.t[a:b], made.problem.kin, config) for a, b in where]
+    turned: list[dict[str, Any]] = []
+    if made.skeleton.kind == "human":
+        runs, turned = seams.one_way(lambda n: part(n).problem, paths, runs, where)
+    runs, exchanged = seams.settle(lambda n: part(n).problem, runs, where)
     joined = chunks.join(made.problem, paths, runs, where)
-    joined.log["seams"] = exchanged
+    joined.log["seams"] = turned + exchanged
     schedule = replace(_effort(config).schedules[fitting.FINAL], rate=POLISH)
     last = chunks.ChunkProgress(progress, runs, len(where))
     return fitting.polish(made.problem, joined, schedule, seed=config.seed, progress=last)

@@ -166,6 +166,5 @@ def soft_lowest(height: Tensor) -> Tensor:
 
 TERMS: dict[str, Term] = {
     "mask": mask, "reach": reach, "flow": flow, "stance": stance, "ground": ground, "limits": limits, "smooth": smooth,
-    "forward": forward, "balance": balance, "prior": prior, "facing": facing, "crossed": crossed,
-    "upright": upright,
+    "forward": forward, "balance": balance, "prior": prior, "facing": facing, "crossed": crossed, "upright": upright,
 }  # fmt: skip

@@ -9,6 +9,7 @@ through; which one, and up to when, is what the terms of the fit like best.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ import torch
 from slomo.reconstruct.hypotheses import as_guess, leg_pairs, turned_around
 from slomo.reconstruct.problem import Problem, Variables, pick, rank
 from slomo.reconstruct.run import Run, join
-from slomo.reconstruct.trajectory import Guess
+from slomo.reconstruct.trajectory import Guess, Trajectory
 
 Array = np.ndarray
 Tensor = torch.Tensor
@@ -40,13 +41,6 @@ class Piece:
     @property
     def frames(self) -> int:
         return self.guess.q.shape[1]
-
-    def ahead(self) -> Array:
-        """(n, 2) unit vectors along which the body faces, of every frame of the chunk."""
-        with torch.no_grad():
-            length = self.x["shape.log_length"].exp()
-            _, R, _ = self.problem.path(self.x, self.guess, length, torch.arange(self.frames))
-        return torch.nn.functional.normalize(R[0, :, :2, 0], dim=-1).numpy()
 
     def feet(self) -> Array:
         """(n, L, 3) body lengths in the root's frame, of every frame of the chunk."""
@@ -71,16 +65,60 @@ class Piece:
         return sorted(dips[np.argsort(alike[dips], kind="stable")][:MOMENTS].tolist())
 
 
+def one_way(
+    problem_of: Callable[[int], Problem],
+    paths: Sequence[Trajectory],
+    runs: Sequence[Run],
+    where: Sequence[tuple[int, int]],
+) -> tuple[list[Run], list[dict[str, Any]]]:
+    """The runs of a person with those turned around that face away from the others, or those others, whichever the fit
+    minds less; and what was turned, for the report. From the front and from the back a person looks alike, and each
+    chunk decides for itself.
+
+    Args:
+        paths: the motion of each chunk over its frames.
+        problem_of, where: as `settle` takes them.
+    """
+    ahead = [_ahead(*own) for own in zip(paths, runs, strict=True)]
+    away = [False]
+    for n, (before, here) in enumerate(pairwise(ahead), 1):
+        shared = where[n - 1][1] - where[n][0]
+        opposed = np.median((before[-shared:] * here[:shared]).sum(1)) < 0
+        away.append(away[-1] != bool(opposed))
+    if not any(away):
+        return list(runs), []
+    turned, worse = [], []
+    for n, run in enumerate(runs):
+        piece = _piece(problem_of(n), run, where[n][0])
+        x, guess = turned_around(piece.problem, piece.x, piece.guess)
+        both = {k: torch.cat([piece.x[k], x[k]]) for k in x}
+        loss = rank(piece.problem, both, join([piece.guess, guess]), draws=DRAWS)
+        worse.append(piece.frames * float(loss[1] - loss[0]))
+        turned.append(replace(run, x=x, guess=guess))
+    cost = [sum(w for w, a in zip(worse, away, strict=True) if a == side) for side in (False, True)]
+    side = cost[1] < cost[0]
+    log = [{"turned_around": True, "chunk": n + 1} for n, a in enumerate(away) if a == side]
+    return [t if a == side else r for r, t, a in zip(runs, turned, away, strict=True)], log
+
+
+def _ahead(path: Trajectory, run: Run) -> Array:
+    """(n, 2) unit vectors along which the body faces, of every frame of a chunk."""
+    every = torch.arange(run.guess.yaw.shape[1])
+    with torch.no_grad():
+        _, R, _ = path(run.x, run.guess, run.x["shape.log_length"].exp(), every)
+    return torch.nn.functional.normalize(R[0, :, :2, 0], dim=-1).numpy()
+
+
 def settle(
     problem_of: Callable[[int], Problem], runs: Sequence[Run], where: Sequence[tuple[int, int]]
 ) -> tuple[list[Run], list[dict[str, Any]]]:
-    """The runs with headings and legs that agree where they meet, and what was exchanged, for the report.
+    """The runs with legs that agree where they meet, and what was exchanged, for the report.
 
     Args:
         problem_of: the problem of a chunk by its number.
         where: first frame and the one behind the last of each chunk.
     """
-    out, log = _one_way(problem_of, runs, where)
+    out, log = list(runs), []
     before = None
     for n in range(1, len(runs)):
         before = before or _piece(problem_of(n - 1), out[n - 1], where[n - 1][0])
@@ -97,35 +135,6 @@ def settle(
         out[n] = replace(out[n], x=here.x, guess=here.guess)
         before = here
     return out, log
-
-
-def _one_way(
-    problem_of: Callable[[int], Problem], runs: Sequence[Run], where: Sequence[tuple[int, int]]
-) -> tuple[list[Run], list[dict[str, Any]]]:
-    """The runs with those turned around that face away from the others, or those others: whichever the fit minds less.
-    From the front and from the back a person looks alike, and each chunk decides for itself (`hypotheses`)."""
-    away, ahead = [False], np.empty((0, 2))
-    for n, run in enumerate(runs):
-        piece = _piece(problem_of(n), run, where[n][0])
-        shared = where[n - 1][1] - where[n][0] if n else 0
-        if n:
-            opposed = np.median((ahead[-shared:] * piece.ahead()[:shared]).sum(1)) < 0
-            away.append(away[-1] != bool(opposed))
-        ahead = piece.ahead()
-    if not any(away):
-        return list(runs), []
-    turned, worse = [], []
-    for n, run in enumerate(runs):
-        piece = _piece(problem_of(n), run, where[n][0])
-        x, guess = turned_around(piece.problem, piece.x, piece.guess)
-        both = {k: torch.cat([piece.x[k], x[k]]) for k in x}
-        loss = rank(piece.problem, both, join([piece.guess, guess]), draws=DRAWS)
-        worse.append(piece.frames * float(loss[1] - loss[0]))
-        turned.append(replace(run, x=x, guess=guess))
-    cost = [sum(w for w, a in zip(worse, away, strict=True) if a == side) for side in (False, True)]
-    side = cost[1] < cost[0]
-    log = [{"turned_around": True, "chunk": n + 1} for n, a in enumerate(away) if a == side]
-    return [t if a == side else r for r, t, a in zip(runs, turned, away, strict=True)], log
 
 
 def _piece(problem: Problem, run: Run, first: int) -> Piece:

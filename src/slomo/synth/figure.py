@@ -164,7 +164,7 @@ def _on_the_spot(c: Creature, name: str, t: Array, rng: np.random.Generator) -> 
     elif name == "jack":
         s = (t / period + rng.random()) % 1.0
         hop = np.where(s < 0.22, s / 0.22, np.where((s >= 0.5) & (s < 0.72), (s - 0.5) / 0.22, 0.0))
-        ease = hop**2 * (3 - 2 * hop)
+        ease = _eased(hop)
         open_ = np.where(s < 0.22, ease, np.where(s < 0.5, 1.0, np.where(s < 0.72, 1 - ease, 0.0)))
         apart = 0.06 + u(0.10, 0.18) * open_
         up = u(0.03, 0.06) * 4 * hop * (1 - hop)
