@@ -16,6 +16,7 @@ from slomo.stage import Artifact, Inputs, Silent
 from slomo.terrain import Box, Terrain
 from slomo.track import metrics
 from slomo.track.lead_in import with_lead_in
+from slomo.track.loop import _fallen
 from slomo.track.stage import Config, run
 
 H = 0.02
@@ -118,6 +119,20 @@ def test_a_fall_is_reported_and_kept():
     assert "fell" in artifact.failure
     assert " s" in m["fall"]
     assert 1.0 < len(artifact.npz["rollout.npz"]["t"]) * 0.002 < 2.4
+
+
+def test_who_rears_as_the_reference_does_has_not_fallen():
+    robot = load_robot("go1")
+
+    def fallen(tilt: float, wanted: float) -> bool:
+        q = np.concatenate([[0, 0, robot.standing_height], Rotation.from_euler("y", -tilt, degrees=True).as_quat()])
+        return _fallen(q, robot.standing_height, wanted, Terrain(), robot, False) is not None
+
+    assert fallen(65, 0)
+    assert fallen(65, 20)
+    assert not fallen(65, 45)
+    assert not fallen(75, 60)
+    assert fallen(95, 60)
 
 
 def test_slippery_ground_shows():

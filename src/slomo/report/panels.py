@@ -194,8 +194,10 @@ def robot_extent(robot: Robot) -> float:
 
 
 def robot_view(t: np.ndarray, body: np.ndarray, robot: Robot, *, azimuth: float) -> View:
-    """From the near feet to over the head at the body's (T, 3) highest, also where it stands on a step."""
-    high = float(np.percentile(body[:, 2], 99)) + 0.6 * robot.standing_height
+    """From the near feet to over the head at the body's (T, 7) highest, also where it stands on a step or rears."""
+    hips = np.einsum("tij,cj->tci", Rotation.from_quat(body[:, 3:7]).as_matrix(), robot.nominal_hips)
+    top = body[:, 2] + hips[..., 2].max(1).clip(min=0)
+    body, high = body[:, :3], float(np.percentile(top, 99)) + 0.6 * robot.standing_height
     # Seen from above, feet nearer than the body lie lower in the picture than the ground under it.
     return View.of(t, body, low=-0.3 * robot.standing_height, high=high, azimuth=azimuth, extent=robot_extent(robot))
 
@@ -230,7 +232,7 @@ class ReferencePanel:
             parts[f"hip{c}"] = parts[f"foot{c}"]
             parts[f"force{c}"] = Part(arrow.vertices, arrow.faces, np.array(VERMILION), smooth=False)
         self._scene = Scene(parts | meshes.terrain_parts(terrain), studio(extent, azimuth))
-        self._view = robot_view(reference.t, reference.q[:, :3], robot, azimuth=azimuth)
+        self._view = robot_view(reference.t, reference.q[:, :7], robot, azimuth=azimuth)
 
     def draw(self, t: float) -> np.ndarray:
         r = self.reference
@@ -267,7 +269,7 @@ class RobotPanel:
         self._scene = Scene(parts | meshes.terrain_parts(terrain), studio(extent, azimuth))
         self._data = robot.model.createData()
         self._frames = {link: robot.model.getFrameId(link) for link in set(self._links.values())}
-        self._view = robot_view(rollout.t, rollout.body[:, :3], robot, azimuth=azimuth)
+        self._view = robot_view(rollout.t, rollout.body, robot, azimuth=azimuth)
 
     def draw(self, t: float) -> np.ndarray:
         r = self.rollout

@@ -20,7 +20,7 @@ from slomo.stage import Arrays, Artifact, Inputs, Progress
 from slomo.synth.score import score
 from slomo.terrain import Terrain
 
-VERSION = 6
+VERSION = 7
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ MOTOR_HZ = 1000
 # s, standing before the controller begins: until the robot is still, and then, while the estimator is at work already.
 STAND, REST = 0.5, 0.5
 LARGEST_TILT = 60.0  # degrees
+BEYOND = 30.0  # degrees over the tilt that the reference has, where it rears or bends that far itself
 LOWEST = 0.5  # of the height that the body should have
 
 
@@ -88,8 +89,8 @@ def simulate(
     steps, every = round((t1 - t0) * MOTOR_HZ), MOTOR_HZ // JOINT_HZ
     recording = Recording(robot, reference, ticks=-(-steps // every))
     joints, fall = JointSpace(robot), None
-    bodies = reference_at(reference, t0 + np.arange(recording.ticks) / JOINT_HZ)[:, :3]
-    wanted = bodies[:, 2] - terrain.height(bodies)
+    bodies = reference_at(reference, t0 + np.arange(recording.ticks) / JOINT_HZ)[:, :7]
+    wanted, wanted_tilt = bodies[:, 2] - terrain.height(bodies), _tilt(bodies)
     for k in range(steps):
         t = t0 + k / MOTOR_HZ
         q, v = simulation.q, simulation.v
@@ -111,7 +112,7 @@ def simulate(
                 controller, t=t, q=q, v=v, q_des=command.q, tau=tau, asked=asked, body=q_point[:7],
                 points=q_point[7:].reshape(-1, 3), lam=forces,
             )  # fmt: skip
-            fall = _fallen(q_point, float(wanted[k // every]), ground, robot, body_down)
+            fall = _fallen(q_point, wanted[k // every], wanted_tilt[k // every], ground, robot, body_down)
             if fall:
                 fall = f"{fall} at {t:.2f} s"
                 break
@@ -159,14 +160,19 @@ def _stand(simulation: Simulation, controller: Controller, ground: Terrain, sens
     return tau
 
 
-def _fallen(q: Array, wanted: float, ground: Terrain, robot: Robot, body_down: bool) -> str | None:
-    """Why this point-foot pose is a fall, if it is one. A reference that lies low (wanted, m) may be followed there."""
-    height = float(q[2] - ground.height(q[:3]))
-    tilt = np.degrees(np.arccos(np.clip(1 - 2 * (q[3] ** 2 + q[4] ** 2), -1, 1)))
+def _fallen(q: Array, wanted: float, wanted_tilt: float, ground: Terrain, robot: Robot, body_down: bool) -> str | None:
+    """Why this point-foot pose is a fall, if it is one. A reference that lies low (wanted, m) or whose body tilts far
+    (wanted_tilt, degrees) may be followed there."""
+    height, tilt = float(q[2] - ground.height(q[:3])), float(_tilt(q))
     if body_down:
         return "the body touches the ground"
     if height < LOWEST * min(robot.standing_height, wanted):
         return f"the body is {height:.2f} m high"
-    if tilt > LARGEST_TILT:
+    if tilt > max(LARGEST_TILT, wanted_tilt + BEYOND):
         return f"the body tilts by {tilt:.0f} degrees"
     return None
+
+
+def _tilt(q: Array) -> Array:
+    """(...,) degrees between the vertical and that of bodies with point-foot configurations q (..., 7 and more)."""
+    return np.degrees(np.arccos(np.clip(1 - 2 * (q[..., 3] ** 2 + q[..., 4] ** 2), -1, 1)))
