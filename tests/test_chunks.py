@@ -42,6 +42,17 @@ def test_chunks_cover_a_clip_and_overlap(seconds):
     assert all(t[b - 1] - t[a] <= chunks.LENGTH + 0.1 for a, b in found if len(found) > 1)
 
 
+def test_a_chunk_that_hardly_shows_the_subject_is_none_of_its_own():
+    where = [(0, 10), (8, 20), (18, 30), (28, 40)]
+    shown = np.ones(40, bool)
+    assert chunks.with_subject(where, shown) == where
+    shown[:12] = False
+    assert chunks.with_subject(where, shown) == [(0, 20), (18, 30), (28, 40)]
+    shown[:] = np.arange(40) < 27
+    assert chunks.with_subject(where, shown) == [(0, 10), (8, 20), (18, 40)]
+    assert chunks.with_subject(where, np.arange(40) == 35) == [(0, 40)]
+
+
 def test_a_cut_is_the_clip_of_those_frames(walk):
     said = dict(
         frame=np.arange(0, T, 2), view=np.tile(np.eye(36)[5], (T // 2, 1)), keypoint_names=np.array(["nose"]),

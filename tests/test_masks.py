@@ -77,6 +77,9 @@ def test_votes_find_what_single_frames_miss_and_stop_at_another_colour():
     # However far apart the frames are that the network saw, those between are filled.
     sparse = {t: masks[t].astype(np.float32) for t in (0, 15)}
     assert iou(np.stack([*vote_over_time(sparse, frames, flow, lambda f: None)]) > 0.5, masks).min() > 0.7
+    # So are those before the first and after the last one.
+    middle = {t: masks[t].astype(np.float32) for t in (7, 8)}
+    assert iou(np.stack([*vote_over_time(middle, frames, flow, lambda f: None)]) > 0.5, masks).min() > 0.6
     # The same piece in another colour in those frames is another point: nothing is carried there.
     for t in (7, 8):
         frames[t][piece[t]] = 255 - frames[t][piece[t]]

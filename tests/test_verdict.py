@@ -58,6 +58,14 @@ def test_what_could_not_be_told_is_unknown_and_not_held_against_it():
     assert {c["name"] for c in found["checks"] if c["level"] == "unknown"} == {"swap_margin", "camera_error_px"}
 
 
+def test_the_opposite_of_legs_on_their_own_has_them_exchanged():
+    own = {"heading": "front", "gait": "none", "legs": "on their own"}
+    rivals = [own | {"loss": 0.80}, {"heading": "front", "gait": "none", "loss": 0.804}]
+    rivals += [own | {"legs": "exchanged", "loss": 1.2}]
+    log = {"rivals": rivals, "final": [own | {"loss": 0.7}], "limbs": [own | {"loss": 0.6}]}
+    assert _swap_margin(log) == pytest.approx(0.5)
+
+
 def test_limits_are_inclusive():
     assert Check("x", 1.0, 1.0, 2.0, "").level == "good"
     assert Check("x", 2.0, 1.0, 2.0, "").level == "poor"

@@ -21,6 +21,7 @@ Tensor = torch.Tensor
 
 LONG = 12.0  # s: clips up to there are fitted as they are
 LENGTH, OVERLAP = 8.0, 1.0  # s
+SHOWN = 0.2  # share of a chunk's frames that show the subject, less than which are too few for a fit of its own
 LEVEL = 0.2  # share of the spread of gravity that a chunk may change: the whole clip decides about it
 BY_FRAME = (
     "box", "view", "view_up", "view_path", "keypoints", "keypoint_confidence", "parts", "surface", "surface_scale",
@@ -36,6 +37,20 @@ def bounds(t: Array) -> list[tuple[int, int]]:
     span = (total + (count - 1) * OVERLAP) / count
     starts = t[0] + np.arange(count) * (span - OVERLAP)
     return [(int(np.searchsorted(t, s - 1e-6)), int(np.searchsorted(t, s + span + 1e-6))) for s in starts]
+
+
+def with_subject(where: Sequence[tuple[int, int]], shown: Array) -> list[tuple[int, int]]:
+    """The chunks, those that hardly show the subject joined to the one before (the first one, to the one after).
+
+    Args:
+        shown: (T,) bool, frames that show it.
+    """
+    out: list[tuple[int, int]] = []
+    for first, last in where:
+        if out and (shown[first:last].mean() < SHOWN or shown[out[-1][0] : out[-1][1]].mean() < SHOWN):
+            first = out.pop()[0]
+        out.append((first, last))
+    return out
 
 
 def cut(inputs: Inputs, first: int, last: int) -> Inputs:

@@ -142,7 +142,7 @@ def gather(arrays: Mapping[str, Array], obs: Observations, skeleton: Skeleton) -
         unit=f(0.1 * size), view=f(view), up=f(up / np.maximum(np.linalg.norm(up, axis=-1, keepdims=True), 1e-9)),
         view_weight=f(has_view) * obs.quality, path=_filled(path, has_view & has_path),
         trunk=torch.as_tensor(known.trunk), node=node, uv=f(uv), confidence=f(confidence), **pairing,
-        box=f(np.where(has_parts[:, None], box * obs.scale, 1.0)),
+        box=f(np.where(has_parts[:, None], box * [*obs.scale, obs.scale.mean()], 1.0)),
         **_likeliest(doubted), parts_weight=f(has_parts) * obs.quality, part_capsules=_capsules(known),
         **points,
     )  # fmt: skip
@@ -164,7 +164,7 @@ def _filled(path: Array, known: Array) -> Array:
 
 
 def _keypoints(
-    arrays: Mapping[str, Array], rows, skeleton: Skeleton, scale: float
+    arrays: Mapping[str, Array], rows, skeleton: Skeleton, scale: Array
 ) -> tuple[Tensor, Array, Array, dict[str, Tensor]]:
     names = [str(n) for n in arrays.get("keypoint_names", ())]
     uv, there = rows("keypoints", like=(len(names), 2))

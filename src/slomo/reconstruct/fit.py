@@ -127,7 +127,7 @@ def _to_gait(
     speed = float(np.median(root.speed))
     steps = _steps(problem, root)
     grid = hypotheses.gait_grid(steps, skeleton, leg=kin.leg, speed=speed, metres=metres, phases=effort.phases_of_gait)
-    if skeleton.kind == "human" and np.linalg.norm(root.middle - root.middle[0], axis=1).max() < STAYS * root.length:
+    if skeleton.kind == "human" and root.travelled < STAYS:
         grid = []  # squats and jumping jacks are no strides
     run.log["stride_candidates_hz"] = sorted({round(g.frequency, 3) for g in grid})
     run.log["stride_clock_power"] = steps.power

@@ -22,7 +22,7 @@ from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import AUTO, USUAL, Skeleton, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 40
+FIT_VERSION = 41
 
 AGAIN = 0.5  # share of the rates with which the winner is fitted once more, beside one with other limbs
 POLISH = 0.4  # share of the rates with which the chunks of a long clip are polished together
@@ -159,6 +159,7 @@ def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
     began, cpu = time.perf_counter(), time.process_time()
     made = prepare(inputs, config)
     where = chunks.bounds(made.problem.obs.t.numpy().astype(float))
+    where = chunks.with_subject(where, np.asarray(made.masks["packed"]).any((1, 2)))
     with one_thread():
         run = _search(made, config, progress) if len(where) == 1 else _long(inputs, made, where, config, progress)
     report: dict[str, Any] = {

@@ -36,7 +36,7 @@ class GaitHypothesis:
 @dataclass(frozen=True)
 class RootGuess:
     """Coarse path of the subject, world units: middle of the body on the ground (T, 2), body length, heading of travel
-    (T,) rad, distance travelled and speed (T,) in body lengths (and s)."""
+    (T,) rad, farthest distance from where it began and speed (T,) in body lengths (and s)."""
 
     middle: Array
     length: float
@@ -53,7 +53,7 @@ def root_guess(obs: Observations, skeleton: Skeleton) -> RootGuess:
     length = path.height / (
         skeleton.root_height + np.quantile(rest, 0.95) + (0.03 if skeleton.kind == "human" else 0.08)
     )
-    travelled = float(np.linalg.norm(path.middle[-1] - path.middle[0])) / length
+    travelled = float(np.linalg.norm(path.middle - path.middle[0], axis=1).max()) / length
     speed = np.linalg.norm(path.velocity, axis=1) / length
     return RootGuess(path.middle, length, path.heading(t, 0.25 * length), travelled, speed)
 

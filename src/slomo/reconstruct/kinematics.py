@@ -17,6 +17,8 @@ Tensor = torch.Tensor
 # where a limb turns, the silhouette where its flesh ends.
 NODE_SPREAD = 0.16  # s.d. of the log length of one offset, beside its group's
 SHIFT_SPREAD = 0.05  # s.d. of the place of a node, body lengths
+# How far apart the limbs of a pair are rooted varies by a share of itself: hips that meet are no hips.
+ROOT_SPREAD = 0.3  # s.d. of how far aside of the trunk a limb's root lies, times that distance; `SHIFT_SPREAD` at most
 RADIUS_SPREAD = 0.18  # s.d. of the log radius of one end of a capsule
 FLESH_SPREAD = 0.03  # s.d. of the place of one end of a capsule against its node, body lengths
 GIRTH_SPREAD = 0.15  # s.d. of the log of all radii together
@@ -94,7 +96,10 @@ class Kinematics:
         self.flip = torch.where(first < torch.arange(len(first)), -1.0, 1.0)
         self.median = (self.mirror == torch.arange(len(first))).float()
         one = torch.ones_like(self.flip)
-        self.shift_spread = SHIFT_SPREAD * torch.stack([one, self.flip * (1 - self.median), one], -1)
+        roots = (self.median == 0) & (self.median[self.link] > 0)
+        aside = torch.where(roots, (ROOT_SPREAD * self.offset[:, 1].abs()).clamp(max=SHIFT_SPREAD), SHIFT_SPREAD)
+        sideways = aside * self.flip * (1 - self.median)
+        self.shift_spread = torch.stack([SHIFT_SPREAD * one, sideways, SHIFT_SPREAD * one], -1)
         self.of_trunk = self.node_variable[(self.median[self.link] > 0) & (torch.arange(len(first)) > 0)].unique()
         self.upright = self._upright() if skeleton.kind == "human" else []
         c_first = torch.minimum(i(skeleton.capsule_mirror), torch.arange(len(self.c_link)))

@@ -32,7 +32,7 @@ class Observations:
 
     Attributes:
         t: (T,) s of all frames; at: (F,) indices of the fit frames; dt: (F-1,) s between them.
-        K: intrinsics of the working resolution; scale: its pixels per decoded pixel.
+        K: intrinsics of the working resolution; scale: (2,) its pixels per decoded pixel, along u and v.
         T_world_cam: (T, 4, 4) as given, but for its tremble.
         mask: (F, n) bool; edge: (F, 1, h, w) px, signed distance to the mask's edge, positive outside.
         draw_in, draw_out: (F, n) cumulative probabilities for drawing mask and background pixels.
@@ -46,7 +46,7 @@ class Observations:
     at: Tensor
     dt: Tensor
     K: Intrinsics
-    scale: float
+    scale: Array
     T_world_cam: Array
     mask: Tensor
     edge: Tensor
@@ -95,18 +95,17 @@ def observe(
         scale = min(scale, float(np.sqrt(MOST_PIXELS / (len(at) * height * width))))
     full = [unpack(masks["packed"][k], masks["shape"]) for k in at]
     w, h = max(16, round(width * scale)), max(16, round(height * scale))
-    scale = w / width
+    scale = np.array([w / width, h / height])  # not quite alike: both sides are whole numbers of pixels
     smaller = lambda x: cv2.resize(np.asarray(x, np.float32), (w, h), interpolation=cv2.INTER_AREA)  # noqa: E731
     mask = np.stack([smaller(m) > 0.5 for m in full])
     K0 = np.asarray(camera["K"], float)
     # Pixel centres are at integers: (u + 1/2) scales, not u.
-    K = Intrinsics(
-        K0[0, 0] * scale, K0[1, 1] * scale, (K0[0, 2] + 0.5) * scale - 0.5, (K0[1, 2] + 0.5) * scale - 0.5, w, h
-    )
+    focal, centre = K0[[0, 1], [0, 1]] * scale, (K0[:2, 2] + 0.5) * scale - 0.5
+    K = Intrinsics(*focal.tolist(), *centre.tolist(), w, h)
     fl, ok = np.empty((len(at) - 1, h, w, 2), np.float32), np.empty((len(at) - 1, h, w), bool)
     for i, (first, last) in enumerate(itertools.pairwise(at.tolist())):
         total, sure = _chain(flow, first, last, (width, height))
-        fl[i], ok[i] = smaller(total) * scale, smaller(sure) > 0.7
+        fl[i], ok[i] = smaller(total) * scale.astype(np.float32), smaller(sure) > 0.7
     T_world_cam = steadied(
         np.asarray(camera["T_world_cam"], float),
         Intrinsics(K0[0, 0], K0[1, 1], K0[0, 2], K0[1, 2], width, height),

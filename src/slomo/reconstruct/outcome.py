@@ -102,7 +102,7 @@ def _swap_margin(log: dict) -> float | None:
     rivals = [(_named(e), e["loss"]) for e in log["rivals"]]
     own = next(loss for name, loss in rivals if name == chosen)
     flips = [
-        {k: v for k, v in chosen.items() if k != key} if key in chosen else chosen | {key: value}
+        {k: v for k, v in chosen.items() if k != key} if chosen.get(key) == value else chosen | {key: value}
         for key, value in (("legs", "exchanged"), ("seen", "turned around"))
     ]
     other = [loss for name, loss in rivals if name in flips]
@@ -151,22 +151,26 @@ def _overlap(problem: Problem, run: Run) -> tuple[float, float, Array]:
     """Silhouette IoU over all fit frames, median flow error in decoded pixels, and IoU of each fit frame (F,)."""
     obs = problem.obs
     ious, errors = [], []
+    pose = problem.pose(run.x, run.guess)
+    look = lambda f, pixels: problem.state(  # noqa: E731
+        run.x, run.guess, Draw(torch.tensor([f]), pixels, pixels.shape[1]), stance_weight=0.0, pose=pose
+    )
     n = obs.mask.shape[1]
     pixels = torch.arange(n)[None]
     for f in range(len(obs.at)):
         inside = torch.nonzero(obs.mask[f])[:, 0][None]
-        state = problem.state(run.x, run.guess, Draw(torch.tensor([f]), pixels, 0), stance_weight=0.0)
+        state = look(f, pixels)
         covered = state.sd[0, 0].amin(-1) < 0
         union = (covered | obs.mask[f]).sum()
         ious.append(float((covered & obs.mask[f]).sum() / union) if union and not obs.empty[f] else np.nan)
         if f == len(obs.at) - 1 or not inside.numel():
             continue
-        state = problem.state(run.x, run.guess, Draw(torch.tensor([f]), inside, inside.shape[1]), stance_weight=0.0)
+        state = look(f, inside)
         c, meets = silhouette.visible(obs.K, state.out, state.sd, state.h)
         X = silhouette.surface(obs.K, state.out, c, state.u, state.v)
         moved = losses.carry(state, torch.tensor([f]), c, X)[0, 0] - torch.stack([state.u[0], state.v[0]], -1)
         e = (moved - obs.flow[f][inside[0]]).norm(dim=-1)
-        errors.append(e[obs.flow_ok[f][inside[0]] & meets[0, 0]].numpy() / obs.scale)
+        errors.append(e[obs.flow_ok[f][inside[0]] & meets[0, 0]].numpy() / obs.scale.mean())
     each = np.array(ious)
     flow_error = float(np.median(np.concatenate(errors))) if errors and sum(map(len, errors)) else float("nan")
     return float(np.nanmean(each)), flow_error, each

@@ -8,7 +8,7 @@ import torch
 
 from slomo.reconstruct import losses, silhouette
 from slomo.reconstruct.evidence import Evidence
-from slomo.reconstruct.kinematics import Kinematics, rot
+from slomo.reconstruct.kinematics import Kinematics, Posed, rot
 from slomo.reconstruct.observations import Observations
 from slomo.reconstruct.state import State, Term
 from slomo.reconstruct.trajectory import Guess, Trajectory
@@ -24,6 +24,19 @@ class Draw:
     seen: Tensor
     pixel: Tensor
     inside: int
+
+
+@dataclass(frozen=True)
+class Pose:
+    """The body and the camera in all fit frames, of which a draw sees some; attributes as of `State`."""
+
+    body: Posed
+    q: Tensor
+    R_root: Tensor
+    shape: dict[str, Tensor]
+    R_cam: Tensor
+    centre: Tensor
+    ends: tuple[Tensor, Tensor]
 
 
 @dataclass(frozen=True)
@@ -73,7 +86,7 @@ class Problem:
         outside = _found(self.obs.draw_out, seen, r[1]).clamp(max=n)
         return Draw(seen, torch.cat([inside, outside], 1), half)
 
-    def state(self, x: Variables, guess: Guess, draw: Draw, *, stance_weight: float) -> State:
+    def pose(self, x: Variables, guess: Guess) -> Pose:
         obs, kin = self.obs, self.kin
         shape = {k.removeprefix("shape."): v for k, v in x.items() if k.startswith("shape.")}
         length = shape["log_length"].exp()
@@ -82,7 +95,12 @@ class Problem:
         R_cam, centre = self.cameras(x["tilt"], obs.at)
         a = silhouette.to_camera(R_cam, centre, body.a)
         b = silhouette.to_camera(R_cam, centre, body.b)
-        out = silhouette.outline(obs.K, a[:, draw.seen], b[:, draw.seen], body.radii)
+        return Pose(body, q, R_root, shape, R_cam, centre, (a, b))
+
+    def state(self, x: Variables, guess: Guess, draw: Draw, *, stance_weight: float, pose: Pose | None = None) -> State:
+        """What a draw sees; pose: of these variables, where it is known already."""
+        obs, kin, p = self.obs, self.kin, pose or self.pose(x, guess)
+        out = silhouette.outline(obs.K, p.ends[0][:, draw.seen], p.ends[1][:, draw.seen], p.body.radii)
         u = (draw.pixel % obs.K.width).float()
         v = torch.div(draw.pixel, obs.K.width, rounding_mode="floor").float()
         sd, h = silhouette.distances(out, u, v)
@@ -90,9 +108,9 @@ class Problem:
         hypothetical = guess.stance[:, obs.at][:, :-1]
         stance = torch.where(hypothetical < 0, hypothetical, stance_weight * hypothetical)
         return State(
-            obs=obs, kin=kin, body=body, q=q, R_root=R_root, shape=shape, tilt=x["tilt"], R_cam=R_cam, centre=centre,
-            seen=draw.seen, u=u, v=v, pixel=draw.pixel, inside=draw.inside, out=out, sd=sd, h=h, near=near, least=least,
-            nearest=nearest, ends=(a, b), stance=stance, x=x,
+            obs=obs, kin=kin, body=p.body, q=p.q, R_root=p.R_root, shape=p.shape, tilt=x["tilt"], R_cam=p.R_cam,
+            centre=p.centre, seen=draw.seen, u=u, v=v, pixel=draw.pixel, inside=draw.inside, out=out, sd=sd, h=h,
+            near=near, least=least, nearest=nearest, ends=p.ends, stance=stance, x=x,
         )  # fmt: skip
 
     def loss(self, x: Variables, guess: Guess, draw: Draw, *, stance_weight: float = 0.0) -> tuple[Tensor, Variables]:

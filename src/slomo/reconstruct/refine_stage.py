@@ -22,7 +22,8 @@ from slomo.reconstruct.run import Run, from_arrays
 from slomo.reconstruct.verdict import Facts, checks, verdict
 from slomo.stage import Artifact, Inputs, Progress
 
-REFINE_VERSION = 13
+REFINE_VERSION = 14
+SHORT = 0.05  # body lengths, added to bones and the skeleton's own: by how much short ones change says little
 TREMBLES = 0.1  # degrees of a camera's rotation, of which the user is told
 
 
@@ -107,7 +108,6 @@ def _facts(inputs: Inputs, made: Prepared, run: Run, outcome: Outcome) -> Facts:
     shape = {k.removeprefix("shape."): v for k, v in run.x.items() if k.startswith("shape.")}
     offset, rest = kin.offsets(shape)[0].norm(dim=-1), kin.offset.norm(dim=-1)
     own = shape["log_length"].exp()[0]
-    bones = (rest > 0.03).numpy()
     return Facts(
         report=outcome.report,
         masks=inputs.artifacts["masks"].json["report.json"],
@@ -116,7 +116,7 @@ def _facts(inputs: Inputs, made: Prepared, run: Run, outcome: Outcome) -> Facts:
         sole=made.skeleton.sole * float(own) * unit,
         t=made.problem.obs.t.numpy().astype(float),
         length=made.metres,
-        stretch=(offset / own / rest.clamp(min=1e-6)).numpy()[bones],
+        stretch=((offset / own + SHORT) / (rest + SHORT)).numpy(),
     )
 
 

@@ -53,7 +53,7 @@ class Facts:
     Attributes:
         report: of the fit (`outcome.assess`). masks: report of the masks. camera: report of the camera.
         feet: (T, F, 3) m; sole: m, height of a standing foot's key point; t: (T,) s; length: m, the body's.
-        stretch: (M,) lengths of the bones over the skeleton's own, the body's length taken off.
+        stretch: (M,) lengths of the bones over the skeleton's own, the body's length taken off; of short ones less.
     """
 
     report: dict[str, Any]
@@ -71,7 +71,6 @@ def checks(f: Facts) -> list[Check]:
     look = "look at the masks; choose the subject with --subject-at, or give your own with --masks"
     frames = max(len(f.t), 1)
     height = (f.feet[..., 2] - f.sole) / f.length
-    bones = f.stretch[f.stretch > 0]
     return [
         Check("mask_quality", f.masks.get("quality_mean"), 0.7, 0.3, look, least=True),
         Check("frames_without_subject", f.masks.get("frames_without_subject", 0) / frames, 0.1, 0.6, look),
@@ -84,7 +83,7 @@ def checks(f: Facts) -> list[Check]:
         Check("foot_skate", f.report["foot_skate_mps"] / f.length, 0.35, 2.5, "standing feet slide: the camera is off"),
         Check("penetration", float(np.quantile(np.maximum(-height, 0), 0.99)), 0.04, 0.4, "feet are below the ground"),
         Check("floating_s", floating(height, f.t), ALOFT, None, "nothing touches the ground: is it a jump?"),
-        Check("bone_change", float(np.abs(np.log(bones)).max()), 0.6, 1.5, "give a --skeleton that is more alike"),
+        Check("bone_change", float(np.abs(np.log(f.stretch)).max()), 0.6, 1.5, "give a --skeleton that is more alike"),
     ]  # fmt: skip
 
 

@@ -30,8 +30,9 @@ def vote_over_time(
         frames: (T, H, W, 3) uint8 RGB.
     """
     T, (height, width) = len(frames), flow.forward.shape[1:3]
-    # Frames between layers that lie further apart still need one on either side.
-    reach = max(REACH, int(np.diff(sorted(layers)).max(initial=0)))
+    # Frames between layers that lie further apart, or beyond the first or last one, still need one in reach.
+    at = sorted(layers)
+    reach = max(REACH, int(np.diff(at).max(initial=0)), *([at[0], T - 1 - at[-1]] if at else []))
     to_cells = np.array([width / flow.size[0], height / flow.size[1]], np.float32)
 
     def small(image: np.ndarray) -> np.ndarray:

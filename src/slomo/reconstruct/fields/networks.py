@@ -66,5 +66,5 @@ def delta(v: Variables, x: Tensor, pose: Tensor) -> Tensor:
         pose: (..., 3 (B - 1)) joint angles over their spread, rad; zeros at rest.
     """
     y = torch.nn.functional.linear(encode(x.flatten(0, -2), 2), v["F.delta.w0"][0].T, v["F.delta.b0"][0, 0])
-    y = y.reshape(*x.shape[:-1], -1) + (pose @ v["F.delta.pose"][0])[..., None, :]
+    y = y.reshape(*x.shape[:-1], y.shape[-1]) + (pose @ v["F.delta.pose"][0])[..., None, :]
     return torch.nn.functional.silu(y) @ v["F.delta.w1"][0] + v["F.delta.b1"][0]

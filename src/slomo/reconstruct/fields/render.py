@@ -87,9 +87,14 @@ def render(s: State, config: FieldsConfig, count: int | None = None) -> Rendered
     return Rendered(
         rays=r, rest=shape, opacity=opacity, colour=colour, depth=(weight * t).sum(1) / opacity.clamp(min=1e-6),
         flow=uv - torch.stack([s.u[here, drawn], s.v[here, drawn]], -1), canonical=at_rest,
-        residual=residual.reshape(t.shape), weight=weight, delta=delta.square().mean() + still.square().mean(),
+        residual=residual.reshape(t.shape), weight=weight, delta=mean(delta.square()) + mean(still.square()),
         queried=asked, queried_weight=top, cycle=(back - came_from).square().sum(-1),
     )  # fmt: skip
+
+
+def mean(x: Tensor) -> Tensor:
+    """Its mean; 0 of nothing, where no ray meets the body."""
+    return x.mean() if x.numel() else x.sum()
 
 
 def _seen(s: State, x: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:

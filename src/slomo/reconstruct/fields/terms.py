@@ -7,7 +7,7 @@ from slomo.reconstruct.fields.background import Background
 from slomo.reconstruct.fields.canonical import Capsules
 from slomo.reconstruct.fields.config import FieldsConfig
 from slomo.reconstruct.fields.networks import Variables
-from slomo.reconstruct.fields.render import Rendered, render
+from slomo.reconstruct.fields.render import Rendered, mean, render
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.losses import FLOW_PX
 from slomo.reconstruct.observations import Observations
@@ -103,7 +103,7 @@ class Fields:
         sdf = fixed.union(points) + networks.residual(dict(s.x), points, self.config.frequencies)[0]
         gradient = sdf.reshape(-1, 4) @ corners / (4 * STEP**2)
         length = (gradient.square().sum(-1) + 1e-8).sqrt()
-        return (length - 1).square().mean()[None]
+        return mean((length - 1).square())[None]
 
     def cycle(self, s: State) -> Tensor:
         """Points come back to where they were after the way to rest and back, in fiftieths of the body length."""
