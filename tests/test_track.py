@@ -211,6 +211,56 @@ def test_lead_in_of_a_motion_that_begins_in_flight():
     assert np.all(whole.u[whole.t[:-1] == -H] == 0)
 
 
+def _lengths(whole: Reference, model: PointFootModel) -> np.ndarray:
+    roots = whole.q[:, None, :3] + np.einsum(
+        "nij,cj->nci", Rotation.from_quat(whole.q[:, 3:7]).as_matrix(), model.leg_roots
+    )
+    return np.linalg.norm(roots - whole.points, axis=-1)
+
+
+@pytest.mark.parametrize("ahead", [0.02, 0.2])
+def test_legs_reach_their_feet_in_the_lead_in(ahead: float):
+    robot = load_robot("go1")
+    model = PointFootModel.from_robot(robot)
+    reference = sway(robot)
+    q, v = reference.q.copy(), reference.v.copy()
+    q[:, 2] += 0.1  # on stretched legs
+    q[:, 7] += ahead  # the front left foot stands further ahead
+    v[0, 0] = 0.6  # and the body comes from behind
+    whole = with_lead_in(
+        dataclasses.replace(reference, q=q, v=v), model, standing=robot.nominal_feet, terrain=Terrain(), settle=0.3,
+        blend=0.6,
+    )  # fmt: skip
+    early = whole.t < -0.3
+    before = _lengths(dataclasses.replace(whole, q=np.where(np.arange(19) == 2, q[0, 2], whole.q)), model)[early]
+    assert np.any(before > model.leg_max + 0.005) or ahead > 0.1  # as high as the motion begins, a leg would not reach
+    assert np.all(_lengths(whole, model)[early] < model.leg_max + 1e-3)
+    stands = whole.points[0, 0, 0] - reference.points[0, 0, 0]
+    assert stands == pytest.approx(ahead, abs=1e-9) if ahead < 0.1 else stands < 0.1  # too far: it steps there
+    n = int(np.sum(whole.t < 0))
+    assert np.abs(np.diff(whole.q[: n + 1, :3], axis=0)).max() < 0.02
+    middle = (whole.q[2:n, :3] - whole.q[: n - 2, :3]) / (2 * H)
+    np.testing.assert_allclose(middle, whole.v[1 : n - 1, :3], atol=0.02)
+
+
+def test_hands_come_along_with_the_body_in_the_lead_in():
+    robot = load_robot("g1")
+    model = PointFootModel.from_robot(robot)
+    t = np.arange(51) * H
+    q, v = np.zeros((51, 7 + 3 * model.C)), np.zeros((51, 6 + 3 * model.C))
+    q[:, 6], q[:, 2] = 1.0, robot.standing_height
+    q[:, 7:] = (robot.nominal_feet + [0, 0, robot.standing_height]).ravel()
+    v[0, 0] = 0.6
+    zero = np.zeros((50, model.C, 3))
+    reference = Reference(t, np.full(50, H), q, v, zero.reshape(50, -1), zero, robot.foot_names, robot.digest)
+    whole = with_lead_in(reference, model, standing=robot.nominal_feet, terrain=Terrain(), settle=0.3, blend=0.6)
+    hands = np.flatnonzero(model.is_hand)
+    rel = whole.points[:, hands] - whole.q[:, None, :3]
+    assert np.abs(whole.q[0, :2]).max() > 0.02
+    np.testing.assert_allclose(rel[0], rel[-1], atol=1e-9)
+    assert np.all(_lengths(whole, model)[whole.t < -0.3] < model.leg_max + 1e-3)
+
+
 def test_errors_of_a_known_offset():
     r = Rollout.from_arrays(swayed().npz["rollout.npz"])
     body = r.body_ref.copy()

@@ -2,8 +2,9 @@
 
 A reference may begin at speed, with feet in the air and its centre of mass beside the feet, and no robot can. The
 lead-in stands near the reference's first pose with every foot on the ground and bearing weight, then moves into it,
-gathers its velocity and lifts the feet that begin in the air. It is a kinematic blend with forces of near-static
-balance, for the controller to follow; it comes before t = 0.
+gathers its velocity and lifts the feet that begin in the air. Every leg reaches its foot: the body stands lower, and
+where a stride is too long for that, one foot steps to where it begins. It is a kinematic blend with forces of
+near-static balance, for the controller to follow; it comes before t = 0.
 """
 
 import numpy as np
@@ -19,6 +20,7 @@ Array = np.ndarray
 SWING = 0.3  # s, in which a foot that begins in the air leaves the ground
 LEAST = 0.6  # of an even share of the weight, what each foot bears in the stand
 IN_AIR = 0.005  # m, height from which a foot counts as in the air
+CROUCH = 0.1  # of the longest leg, by how much the body stands lower rather than have a foot step
 
 
 def with_lead_in(
@@ -27,48 +29,23 @@ def with_lead_in(
     """The reference with `settle` + `blend` (s) before its start, at negative times, in steps of its first h.
 
     Args:
-        standing: (C, 3) m, base frame, where the points are when the robot just stands. Feet that begin in the air come
-            from there: under where they begin a leg may not reach the ground.
+        standing: (C, 3) m, base frame, where the points are when the robot just stands. Feet that begin in the air, or
+            too far from the body to stand there, come from there.
     """
-    h, T0 = float(reference.h[0]), settle + blend
-    n = max(2, int(np.ceil(T0 / h)))
-    t = np.arange(-n, 0) * h
-    q0, v0 = reference.q[0], reference.v[0]
-    q, v = np.tile(q0, (n, 1)), np.zeros((n, len(v0)))
-
-    # Body: x(s) = x0 + v0 T (s^3 - 1) / 3 ends at x0 with v0, and starts at rest without a jump of acceleration.
-    # Height and orientation must also start where they end: z(s) = z0 + vz T (s^3 - s^2).
-    s_body = s = np.clip(1 + t / blend, 0, 1)
-    there, back, speed_back = (s**3 - 1) * blend / 3, (s**3 - s**2) * blend, 3 * s**2 - 2 * s
-    q[:, :2] += there[:, None] * v0[:2]
-    q[:, 2] += back * v0[2]
-    q[:, 3:7] = (Rotation.from_quat(q0[3:7]) * Rotation.from_rotvec(back[:, None] * v0[3:6])).as_quat()
-    v[:, :2], v[:, 2:6] = (s**2)[:, None] * v0[:2], speed_back[:, None] * v0[2:6]
-    q[:, 3:7] *= np.where(q[:, 3:7] @ q0[3:7] < 0, -1.0, 1.0)[:, None]
-
-    points = q[:, 7:].reshape(n, -1, 3)
-    speeds = v[:, 6:].reshape(n, -1, 3)
-    stance = np.ones(points.shape[:2], bool)
-    s = np.clip(1 + t / SWING, 0, 1)
-    arrive, speed = s**2 * (3 - 2 * s), 6 * s * (1 - s) / SWING
-    late, late_speed = (s**3 - s**2) * SWING, 3 * s**2 - 2 * s
-    p0, w0 = reference.points[0], v0[6:].reshape(-1, 3)
-    for c in np.flatnonzero(_lifted(model, p0, terrain)):
-        ground, end = _stand_at((q[0] + q0) / 2, standing[c], terrain), p0[c]
-        points[:, c] = ground + arrive[:, None] * (end - ground)
-        speeds[:, c] = speed[:, None] * (end - ground)
-        points[:, c, :2] += late[:, None] * w0[c, :2]
-        speeds[:, c, :2] += late_speed[:, None] * w0[c, :2]
-        points[:, c, 2] = np.maximum(points[:, c, 2], terrain.height(points[:, c]))
-        stance[:, c] = s <= 0
-    for c in np.flatnonzero(model.is_hand):
-        points[:, c] += ((s**3 - 1) * SWING / 3)[:, None] * w0[c]
-        speeds[:, c] = (s**2)[:, None] * w0[c]
-        stance[:, c] = False
-    # The body stands where every foot bears weight, and comes from there, from rest to rest.
-    aside = _into_balance(model, q[0, :3], points[0])
-    q[:, :2] += (1 - s_body**3 * (10 - 15 * s_body + 6 * s_body**2))[:, None] * aside
-    v[:, :2] -= (30 * s_body**2 * (1 - s_body) ** 2 / blend)[:, None] * aside
+    lifted = _lifted(model, reference.points[0], terrain)
+    for _ in range(model.C):
+        lead = _Lead(reference, model, lifted, standing=standing, terrain=terrain, settle=settle, blend=blend)
+        lower = lead.lower()
+        stays = ~lifted & ~model.is_hand
+        worst = int(np.where(stays, lower, 0).argmax())
+        foot = _foot(model, worst)
+        if lower[worst] <= CROUCH * model.leg_max.max() or not stays[~foot].any():
+            break
+        lifted = lifted | foot
+    lead.sink(min(float(lower.max()), CROUCH * float(model.leg_max.max())))
+    lead.carry_hands(reference)
+    h, t, q, v, points, stance = lead.h, lead.t, lead.q, lead.v, lead.points, lead.stance
+    n = len(t)
 
     acceleration = np.gradient(v[:, :3], h, axis=0)
     u = np.array([balance(model, q[k, :3], points[k], stance[k], acceleration[k]) for k in range(n)])
@@ -85,12 +62,108 @@ def with_lead_in(
     )
 
 
+class _Lead:
+    """The lead-in's configurations, with `lifted` (C,) the feet that come from where the robot just stands.
+
+    Attributes:
+        h: s.  t: (n,) s.  q: (n, 7 + 3 C), v: (n, 6 + 3 C), and points, speeds (n, C, 3), which are views into them.
+        stance: (n, C) bool.  fade: (n,) from 1 in the stand to 0, smooth; fade_speed: its derivative, 1/s.
+    """
+
+    def __init__(
+        self,
+        reference: Reference,
+        model: PointFootModel,
+        lifted: Array,
+        *,
+        standing: Array,
+        terrain: Terrain,
+        settle: float,
+        blend: float,
+    ):
+        self.model = model
+        h, T0 = float(reference.h[0]), settle + blend
+        n = max(2, int(np.ceil(T0 / h)))
+        t = np.arange(-n, 0) * h
+        q0, v0 = reference.q[0], reference.v[0]
+        q, v = np.tile(q0, (n, 1)), np.zeros((n, len(v0)))
+
+        # Body: x(s) = x0 + v0 T (s^3 - 1) / 3 ends at x0 with v0, and starts at rest without a jump of acceleration.
+        # Height and orientation must also start where they end: z(s) = z0 + vz T (s^3 - s^2).
+        s = np.clip(1 + t / blend, 0, 1)
+        there, back, speed_back = (s**3 - 1) * blend / 3, (s**3 - s**2) * blend, 3 * s**2 - 2 * s
+        self.fade, self.fade_speed = 1 - s**3 * (10 - 15 * s + 6 * s**2), -30 * s**2 * (1 - s) ** 2 / blend
+        q[:, :2] += there[:, None] * v0[:2]
+        q[:, 2] += back * v0[2]
+        q[:, 3:7] = (Rotation.from_quat(q0[3:7]) * Rotation.from_rotvec(back[:, None] * v0[3:6])).as_quat()
+        v[:, :2], v[:, 2:6] = (s**2)[:, None] * v0[:2], speed_back[:, None] * v0[2:6]
+        q[:, 3:7] *= np.where(q[:, 3:7] @ q0[3:7] < 0, -1.0, 1.0)[:, None]
+
+        points, speeds = q[:, 7:].reshape(n, -1, 3), v[:, 6:].reshape(n, -1, 3)
+        stance = np.tile(~model.is_hand, (n, 1))
+        s = np.clip(1 + t / SWING, 0, 1)
+        arrive, speed = s**2 * (3 - 2 * s), 6 * s * (1 - s) / SWING
+        late, late_speed = (s**3 - s**2) * SWING, 3 * s**2 - 2 * s
+        p0, w0 = reference.points[0], v0[6:].reshape(-1, 3)
+        for c in np.flatnonzero(lifted):
+            ground, end = _stand_at((q[0] + q0) / 2, standing[c], terrain), p0[c]
+            points[:, c] = ground + arrive[:, None] * (end - ground)
+            speeds[:, c] = speed[:, None] * (end - ground)
+            points[:, c, :2] += late[:, None] * w0[c, :2]
+            speeds[:, c, :2] += late_speed[:, None] * w0[c, :2]
+            points[:, c, 2] = np.maximum(points[:, c, 2], terrain.height(points[:, c]))
+            stance[:, c] = s <= 0
+        self.h, self.t, self.q, self.v, self.points, self.speeds, self.stance = h, t, q, v, points, speeds, stance
+        # The body stands where every foot bears weight, and comes from there, from rest to rest.
+        self._shift(np.append(_into_balance(model, q[0, :3], points[0]), 0.0))
+
+    def _shift(self, by: Array) -> None:
+        """Stand off the way by `by` (3,) m."""
+        self.q[:, :3] += self.fade[:, None] * by
+        self.v[:, :3] += self.fade_speed[:, None] * by
+
+    def lower(self) -> Array:
+        """(C,) m: how much lower the body had to stand so that each leg reaches its foot; inf where no height does."""
+        early = self.fade > 0.5
+        roots = self.q[early, None, :3] + np.einsum(
+            "nij,cj->nci", Rotation.from_quat(self.q[early, 3:7]).as_matrix(), self.model.leg_roots
+        )
+        along = roots - self.points[early]
+        aside = self.model.leg_max**2 - np.sum(along[..., :2] ** 2, axis=-1)
+        need = np.where(aside > 0, along[..., 2] - np.sqrt(np.maximum(aside, 0)), np.inf) / self.fade[early, None]
+        return np.where(self.model.is_hand, 0.0, np.maximum(need, 0).max(0))
+
+    def sink(self, by: float) -> None:
+        """Stand lower by so much (m)."""
+        self._shift(np.array([0.0, 0.0, -by]))
+
+    def carry_hands(self, reference: Reference) -> None:
+        """Hands are where the reference begins as the body has them, and gather their speed in the last `SWING`."""
+        q0, v0 = reference.q[0], reference.v[0]
+        R, R0 = Rotation.from_quat(self.q[:, 3:7]), Rotation.from_quat(q0[3:7])
+        s = np.clip(1 + self.t / SWING, 0, 1)
+        for c in np.flatnonzero(self.model.is_hand):
+            rel = R0.inv().apply(reference.points[0, c] - q0[:3])
+            speed = R0.inv().apply(v0[6 + 3 * c : 9 + 3 * c] - v0[:3]) - np.cross(v0[3:6], rel)
+            path = self.q[:, :3] + R.apply(rel + ((s**3 - s**2) * SWING)[:, None] * speed)
+            self.points[:, c] = path
+            self.speeds[:, c] = np.gradient(path, self.h, axis=0)
+
+
 def _lifted(model: PointFootModel, points: Array, terrain: Terrain) -> Array:
     """(C,) bool, which feet at points (C, 3) begin in the air; of toe and heel only both."""
     lifted = (points[:, 2] - terrain.height(points) > IN_AIR) & ~model.is_hand
     for toe, heel in model.pairs:
         lifted[[toe, heel]] = lifted[toe] and lifted[heel]
     return lifted
+
+
+def _foot(model: PointFootModel, c: int) -> Array:
+    """(C,) bool, the points on the foot of point c."""
+    foot = np.arange(model.C) == c
+    for pair in model.pairs:
+        foot[pair] |= c in pair
+    return foot
 
 
 def _stand_at(body: Array, foot: Array, terrain: Terrain) -> Array:
