@@ -243,22 +243,44 @@ def test_legs_reach_their_feet_in_the_lead_in(ahead: float):
     np.testing.assert_allclose(middle, whole.v[1 : n - 1, :3], atol=0.02)
 
 
-def test_hands_come_along_with_the_body_in_the_lead_in():
+def _standing_g1(**lifted: float) -> tuple[PointFootModel, Reference]:
+    """A G1 that stands and is about to walk, some of its points (by name) m higher."""
     robot = load_robot("g1")
     model = PointFootModel.from_robot(robot)
     t = np.arange(51) * H
     q, v = np.zeros((51, 7 + 3 * model.C)), np.zeros((51, 6 + 3 * model.C))
     q[:, 6], q[:, 2] = 1.0, robot.standing_height
     q[:, 7:] = (robot.nominal_feet + [0, 0, robot.standing_height]).ravel()
+    for name, up in lifted.items():
+        q[:, 9 + 3 * model.names.index(name)] += up
     v[0, 0] = 0.6
     zero = np.zeros((50, model.C, 3))
-    reference = Reference(t, np.full(50, H), q, v, zero.reshape(50, -1), zero, robot.foot_names, robot.digest)
-    whole = with_lead_in(reference, model, standing=robot.nominal_feet, terrain=Terrain(), settle=0.3, blend=0.6)
-    hands = np.flatnonzero(model.is_hand)
-    rel = whole.points[:, hands] - whole.q[:, None, :3]
+    return model, Reference(t, np.full(50, H), q, v, zero.reshape(50, -1), zero, robot.foot_names, robot.digest)
+
+
+def test_hands_come_along_with_the_body_in_the_lead_in():
+    model, reference = _standing_g1()
+    standing = load_robot("g1").nominal_feet
+    whole = with_lead_in(reference, model, standing=standing, terrain=Terrain(), settle=0.3, blend=0.6)
+    rel = whole.points[:, np.flatnonzero(model.is_hand)] - whole.q[:, None, :3]
     assert np.abs(whole.q[0, :2]).max() > 0.02
-    np.testing.assert_allclose(rel[0], rel[-1], atol=1e-9)
+    np.testing.assert_allclose(rel[0], rel[-1], atol=0.02)
+    np.testing.assert_allclose(rel[0], (reference.points[0] - reference.q[0, :3])[model.is_hand], atol=1e-9)
     assert np.all(_lengths(whole, model)[whole.t < -0.3] < model.leg_max + 1e-3)
+
+
+def test_nobody_stands_on_toes_alone_before_the_motion():
+    model, reference = _standing_g1(left_heel=0.03)
+    standing = load_robot("g1").nominal_feet
+    whole = with_lead_in(reference, model, standing=standing, terrain=Terrain(), settle=0.3, blend=0.6)
+    toe, heel = (model.names.index(n) for n in ("left_toe", "left_heel"))
+    np.testing.assert_allclose(whole.points[0, :, 2][~model.is_hand], 0, atol=1e-9)
+    apart = np.linalg.norm(whole.points[0, toe] - whole.points[0, heel])
+    assert apart == pytest.approx(model.pair_length[0], abs=1e-6)
+    assert np.all(whole.lam[0, [toe, heel], 2] > 0.05 * model.total_mass * model.g)
+    np.testing.assert_array_equal(whole.points[whole.t < 0, toe], np.broadcast_to(reference.points[0, toe], (45, 3)))
+    last = int(np.sum(whole.t < 0)) - 1
+    assert whole.points[last, heel, 2] == pytest.approx(0.03, abs=3e-3)
 
 
 def test_errors_of_a_known_offset():

@@ -106,7 +106,7 @@ class _Lead:
         late, late_speed = (s**3 - s**2) * SWING, 3 * s**2 - 2 * s
         p0, w0 = reference.points[0], v0[6:].reshape(-1, 3)
         for c in np.flatnonzero(lifted):
-            ground, end = _stand_at((q[0] + q0) / 2, standing[c], terrain), p0[c]
+            ground, end = _ground(model, c, lifted, (q[0] + q0) / 2, p0, standing, terrain), p0[c]
             points[:, c] = ground + arrive[:, None] * (end - ground)
             speeds[:, c] = speed[:, None] * (end - ground)
             points[:, c, :2] += late[:, None] * w0[c, :2]
@@ -151,11 +151,8 @@ class _Lead:
 
 
 def _lifted(model: PointFootModel, points: Array, terrain: Terrain) -> Array:
-    """(C,) bool, which feet at points (C, 3) begin in the air; of toe and heel only both."""
-    lifted = (points[:, 2] - terrain.height(points) > IN_AIR) & ~model.is_hand
-    for toe, heel in model.pairs:
-        lifted[[toe, heel]] = lifted[toe] and lifted[heel]
-    return lifted
+    """(C,) bool, which feet (or toes, or heels) at points (C, 3) begin in the air."""
+    return (points[:, 2] - terrain.height(points) > IN_AIR) & ~model.is_hand
 
 
 def _foot(model: PointFootModel, c: int) -> Array:
@@ -164,6 +161,20 @@ def _foot(model: PointFootModel, c: int) -> Array:
     for pair in model.pairs:
         foot[pair] |= c in pair
     return foot
+
+
+def _ground(
+    model: PointFootModel, c: int, lifted: Array, body: Array, points: Array, standing: Array, terrain: Terrain
+) -> Array:
+    """(3,) m, where lifted point c comes from: a heel (or toe) whose other end stays, from flat on the ground beside
+    it, for on toes alone nobody stands; a whole foot from where it is when the robot just stands."""
+    for p, pair in enumerate(model.pairs):
+        if c in pair and not lifted[pair].all():
+            other = points[pair[0] if c == pair[1] else pair[1]]
+            along = points[c, :2] - other[:2]
+            xy = other[:2] + model.pair_length[p] / np.linalg.norm(along) * along
+            return np.append(xy, terrain.height(xy))
+    return _stand_at(body, standing[c], terrain)
 
 
 def _stand_at(body: Array, foot: Array, terrain: Terrain) -> Array:

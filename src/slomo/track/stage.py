@@ -18,7 +18,7 @@ from slomo.track.cyclic import repeated
 from slomo.track.disturbance import Disturbance, Push
 from slomo.track.loop import simulate
 
-VERSION = 6
+VERSION = 7
 
 
 @dataclass(frozen=True)
