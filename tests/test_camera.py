@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from slomo.errors import UsageError
 from slomo.reconstruct.camera import CameraSettings, estimate_camera
-from slomo.reconstruct.ground import find_ground, gravity_from_lines, up_vector
+from slomo.reconstruct.ground import find_ground, gravity_from_lines
 from slomo.reconstruct.resection import interpolate_poses
 from slomo.reconstruct.stage import CameraConfig, DecodeConfig, pack, run_camera, run_decode
 from slomo.stage import Artifact, Inputs, Silent
@@ -104,7 +104,9 @@ def test_no_ground_among_few_points():
 @pytest.mark.parametrize(("pitch", "roll"), [(20.0, 3.0), (5.0, -4.0), (-4.0, 1.0)])
 def test_gravity_from_vertical_lines(pitch, roll):
     """A camera with a wide lens before upright bars."""
-    focal, up = 250.0, up_vector(np.radians(pitch), np.radians(roll))
+    # Looks down by pitch, and is rolled clockwise: y points down in the camera frame, z ahead.
+    up = Rotation.from_euler("ZX", [-roll, pitch], degrees=True).apply([0, -1.0, 0])
+    focal = 250.0
     forward = np.array([0, 0, 1.0]) - up[2] * up
     forward /= np.linalg.norm(forward)
     side = np.cross(forward, up)
@@ -114,7 +116,7 @@ def test_gravity_from_vertical_lines(pitch, roll):
         pixels = np.array([focal * p[:2] / p[2] + CENTER for p in bar if p[2] > 0.1])
         cv2.fillPoly(image, [np.int32(16 * pixels)], (40 + 10 * k,) * 3, cv2.LINE_AA, shift=4)
     g = gravity_from_lines(image[None], np.zeros((1, 240, 320), bool), np.eye(3)[None], focal, CENTER)
-    assert np.degrees(np.arccos(g.up @ up)) < 1.5
+    assert np.linalg.norm(g.up - up) < np.radians(1.5)
     assert g.lines >= 5
 
 

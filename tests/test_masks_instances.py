@@ -367,7 +367,9 @@ def test_look_knows_its_own():
     assert look.likeness(frames[2], a[2]) < 0.6
 
 
-VIDEO = dict(source_width=1280, source_height=720, rotation=0, width=640, height=360, start_s=1.0, fps=20.0)
+VIDEO = dict(
+    source_width=1280, source_height=720, pixel_aspect=1.0, rotation=0, width=640, height=360, start_s=1.0, fps=20.0
+)
 
 
 def test_what_the_user_points_at():
@@ -376,6 +378,11 @@ def test_what_the_user_points_at():
     assert choose((), (100, 200, 60, 20, 2.0), VIDEO, 50) == Choice(20, box=(30.0, 10.0, 50.0, 100.0))
     turned = VIDEO | dict(rotation=90, width=360, height=640)
     assert choose((360, 1280), (), turned, 50).point == (180.0, 640.0)
+    wide = VIDEO | dict(source_width=960, pixel_aspect=4 / 3)  # players show it 1280 px wide
+    assert choose((1200, 180), (), wide, 50).point == pytest.approx((600.0, 90.0))
+    assert choose((), (0, 0, 320, 720), wide, 50).box == pytest.approx((0.0, 0.0, 160.0, 360.0))
+    narrow = wide | dict(rotation=90, width=360, height=640)
+    assert choose((360, 1200), (), narrow, 50).point == pytest.approx((180.0, 600.0))
     for at, box, what in (
         ((1, 2), (1, 2, 30, 40), "a point and a box"),
         ((1,), (), "has 1 numbers"),

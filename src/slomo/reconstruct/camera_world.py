@@ -10,6 +10,11 @@ from slomo.reconstruct import ground, resection, scale_breaks, sfm
 
 GROUND_SUPPORT = 0.08  # part of the weight of all sparse points that a plane needs to be taken for the ground
 SLOPE_DEG = 1.0  # standard deviation of the slope of what subjects walk on
+# Of the median distance of the sparse points: least height of the lowest camera over the lowest of them, and the height
+# that it is given where it has less. A camera that looks down by 12 degrees at ground so far away is so high.
+_LEAST_HEIGHT, _GUESSED_HEIGHT = 0.02, 0.2
+_SCALE = "mean camera height over the ground set to 1"
+GUESSED_SCALE = "guessed camera height set to 1"
 
 
 @dataclass(frozen=True)
@@ -56,8 +61,8 @@ def _gravity_report(g: ground.Gravity, focal_std: float) -> dict[str, Any]:
 def turning(
     frames, masks, R: np.ndarray, focal: float, focal_std: float, center: np.ndarray, report: dict[str, Any]
 ) -> CameraPath:
-    """A camera at height 1 that turns by R (T, 3, 3); the first frame's camera is the frame of R. The report, to which
-    more is added, says mode and reprojection error."""
+    """A camera at height 1 that turns by R (T, 3, 3); the first key frame's camera is the frame of R. The report, to
+    which more is added, says mode and reprojection error."""
     g = _gravity(frames, masks, R, focal, center)
     T = np.tile(np.eye(4), (len(frames), 1, 1))
     T[:, :3, :3] = _world_from(g.up, R[0][:, 2]) @ R
@@ -78,7 +83,7 @@ def moving(
     axes = Rotation.from_matrix(path[:, :3, :3]).mean().as_matrix()
     plane = ground.find_ground(structure.points, weights, axes, path[:, :3, 3])
     if plane is not None and plane.support > GROUND_SUPPORT:
-        up, offset = plane.normal, plane.offset
+        up, offset, scale_source = plane.normal, plane.offset, _SCALE
         report |= {
             "up_source": "ground plane",
             "gravity_std_deg": float(np.hypot(np.degrees(plane.tilt_std), SLOPE_DEG)),
@@ -88,7 +93,7 @@ def moving(
     else:
         g = _gravity(frames, masks, np.swapaxes(path[:1, :3, :3], 1, 2) @ path[:, :3, :3], structure.focal, center)
         up = path[0, :3, :3] @ g.up
-        offset = float(np.quantile(structure.points @ up, 0.02))
+        offset, scale_source = _lowest(structure.points, path[:, :3, 3], up)
         report |= _gravity_report(g, focal_std / structure.focal)
     scale = 1.0 / float((path[:, :3, 3] @ up - offset).mean())
     turn = _world_from(up, path[0, :3, 2])
@@ -106,9 +111,19 @@ def moving(
         "sparse_points": len(structure.points),
         "least_angle_deg": structure.least_angle,
         "scale_breaks": [{"after_frame": frame, "times": round(ratio, 3)} for frame, ratio in breaks],
-        "scale_source": "mean camera height over the ground set to 1",
+        "scale_source": scale_source,
     }
     return CameraPath(K, T, report)
+
+
+def _lowest(points: np.ndarray, centers: np.ndarray, up: np.ndarray) -> tuple[float, str]:
+    """How far up (3,) the ground is that the lowest sparse points (P, 3) lie on, and where the scale comes from: from
+    the cameras' (T, 3) height over it, or a guess of it where those points are no lower than the cameras."""
+    offset, camera = float(np.quantile(points @ up, 0.02)), float((centers @ up).min())
+    distance = float(np.median(np.linalg.norm(points - centers.mean(0), axis=-1)))
+    if camera - offset > _LEAST_HEIGHT * distance:
+        return offset, _SCALE
+    return camera - _GUESSED_HEIGHT * distance, GUESSED_SCALE
 
 
 def _near_feet(structure: sfm.Structure, masks: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from slomo.reconstruct.rotation_ba import skew
 from slomo.reconstruct.sfm import Structure
 
 _MOST_CAMERAS, _MOST_POINTS = 120, 1200  # that the focal length's certainty is computed from, about
@@ -58,10 +59,7 @@ def _linearise(s: Structure, center: np.ndarray):
     projection = np.zeros((len(X), 2, 3))
     projection[:, 0, 0] = projection[:, 1, 1] = s.focal / z
     projection[:, :, 2] = -s.focal * u / z[:, None]
-    skew = np.zeros((len(X), 3, 3))
-    skew[:, 0, 1], skew[:, 0, 2], skew[:, 1, 2] = -X[:, 2], X[:, 1], -X[:, 0]
-    skew = skew - np.swapaxes(skew, 1, 2)
-    by_pose = np.concatenate([-projection @ skew, projection], -1)
+    by_pose = np.concatenate([-projection @ skew(X), projection], -1)
     return s.focal * u + center - s.xy, by_pose, u, projection @ np.swapaxes(R, 1, 2)
 
 

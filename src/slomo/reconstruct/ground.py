@@ -7,6 +7,8 @@ import numpy as np
 
 from slomo.reconstruct.certainty import fit_plane, plane_std
 
+_LEAST_LIKELY = 2e-3  # of `_likely`: a camera that looks down by 68 degrees, or is rolled by 35
+
 
 @dataclass(frozen=True)
 class Plane:
@@ -27,7 +29,8 @@ class Plane:
 def find_ground(
     points: np.ndarray, weights: np.ndarray, axes: np.ndarray, centers: np.ndarray, *, seed: int = 0
 ) -> Plane | None:
-    """RANSAC for the ground: below all cameras, seen at a likely pitch and roll, with most points on it.
+    """RANSAC for the ground: below all cameras, seen at a likely pitch and roll, with most points on it. None where
+    there is no such plane.
 
     Args:
         points: (P, 3) sparse points.  weights: (P,) how near each lies to where the subject stands.
@@ -48,7 +51,7 @@ def find_ground(
         if size < 1e-9 * distance.max() ** 2:
             continue
         normal /= size * np.sign(normal @ up or 1.0)
-        if np.any(centers @ normal - normal @ a <= 0):
+        if not _may_be_ground(normal, float(normal @ a), axes, centers):
             continue
         height = points @ normal - normal @ a
         # What hangs below the ground speaks against it (table tops have floor under them), though less than what lies
@@ -67,9 +70,17 @@ def find_ground(
         fitted, mean = fit_plane(points[on], (weights / tolerance**2)[on])
         normal = fitted * np.sign(fitted @ up or 1.0)
         offset = float(normal @ mean)
+    # With other points, the plane may have turned away from what was drawn.
+    if not _may_be_ground(normal, offset, axes, centers):
+        return None
     on = abs(points @ normal - offset) < 1.5 * tolerance
     std = plane_std(points[on], (weights / tolerance**2)[on], normal)
     return Plane(normal, offset, on, float(weights[on].sum() / weights.sum()), std)
+
+
+def _may_be_ground(normal: np.ndarray, offset: float, axes: np.ndarray, centers: np.ndarray) -> bool:
+    """Whether the plane {x: normal . x = offset} lies below all cameras (T, 3), and is no wall seen from the front."""
+    return bool(np.all(centers @ normal > offset)) and _likely(axes.T @ normal) > _LEAST_LIKELY
 
 
 def _likely(up: np.ndarray) -> float:
@@ -102,12 +113,6 @@ ROLL_STD = np.radians(2.5)
 # The camera's height in heights of the subject: a cat seen standing up is 5, a horse or a person under 1; mean and
 # standard deviation of the logarithm.
 LOG_HEIGHT, LOG_HEIGHT_STD = np.log(1.3), 0.8
-
-
-def up_vector(pitch: float, roll: float) -> np.ndarray:
-    """Up in the camera frame for a camera that looks down by `pitch` and is rolled clockwise by `roll` (rad)."""
-    c, s = np.cos(pitch), np.sin(pitch)
-    return np.array([c * -np.sin(roll), -c * np.cos(roll), -s])
 
 
 def gravity_from_lines(

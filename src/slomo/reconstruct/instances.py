@@ -39,7 +39,7 @@ class Choice:
 
 
 def choose(at: tuple[float, ...], box: tuple[float, ...], video: Mapping[str, Any], frames: int) -> Choice:
-    """From what the user gave, in pixels of the upright clip: `at` (u, v[, s]) or `box` (u0, v0, u1, v1[, s]).
+    """From what the user gave, in (square) pixels of the upright clip: `at` (u, v[, s]) or `box` (u0, v0, u1, v1[, s]).
 
     Args:
         video: `video.json` of the decoded clip; without it pixels of the clip are those of the frames.
@@ -59,7 +59,7 @@ def choose(at: tuple[float, ...], box: tuple[float, ...], video: Mapping[str, An
         raise UsageError(f"has {len(given)} numbers", where=where, valid=valid)
     xy = given[:count].reshape(-1, 2)
     if video:
-        size = np.array([video["source_width"], video["source_height"]], float)
+        size = np.array([video["source_width"] * video["pixel_aspect"], video["source_height"]])  # as players show it
         size = size[::-1] if round(video["rotation"] / 90) % 2 else size
         if (xy < 0).any() or (xy > size).any():
             raise UsageError(

@@ -38,12 +38,14 @@ def fit_rotations(
     focal: float,
     refine_focal: bool,
 ) -> RotationFit:
-    """Fit rotations of `count` frames to correspondences.
+    """Fit rotations of `count` frames to correspondences. Without any, no frame turns.
 
     Args:
         which: (P, 2) frames of each pair.  first, second: (P, 2) px.
         center: (2,) px, principal point.  focal: px, start (and result when not `refine_focal`).
     """
+    if len(which) == 0:
+        return RotationFit(np.tile(np.eye(3), (count, 1, 1)), focal, np.inf, np.zeros(0))
     x, y = first - center, second - center
     i, j = which.T
 

@@ -13,9 +13,9 @@ from slomo.errors import InvalidData, UsageError
 from slomo.reconstruct.video import decode
 from slomo.stage import Artifact, Inputs, Progress
 
-DECODE_VERSION = 2
-MASKS_VERSION = 22
-CAMERA_VERSION = 8
+DECODE_VERSION = 3
+MASKS_VERSION = 23
+CAMERA_VERSION = 9
 QUALITIES = ("draft", "normal", "high")
 
 SEGMENTERS = ("auto", "u2netp", "still", "motion", "user")
@@ -91,6 +91,13 @@ class CameraConfig:
     features: int = 1200
     overlap: int = 5
     seed: int = 0
+
+    def __post_init__(self):
+        counts = (("key_every", 0, 10**6), ("features", 1, 10**5), ("overlap", 1, 10**3), ("seed", 0, 2**31 - 1))
+        for name, least, most in (*counts, ("fov_deg", 1, 170), ("default_fov_deg", 1, 170)):
+            value = getattr(self, name)
+            if not (least <= value <= most or (value == 0 and name == "fov_deg")):
+                raise UsageError(f"is {value}", where=f"camera.{name}", valid=[f"{least} to {most}"])
 
 
 def run_decode(inputs: Inputs, config: DecodeConfig, progress: Progress) -> Artifact:
@@ -178,17 +185,12 @@ def run_camera(inputs: Inputs, config: CameraConfig, progress: Progress) -> Arti
 
     Raises:
         StageFailed: structure from motion died.
-        UsageError: a field of view that no lens has.
     """
     from slomo.reconstruct.camera import CameraSettings, estimate_camera
 
     decoded = inputs.artifacts["decode"]
     frames, t = decoded.npz["frames.npz"]["frames"], decoded.npz["frames.npz"]["t"]
     masks = unpack(inputs.artifacts["masks"].npz["masks.npz"])
-    for name in ("fov_deg", "default_fov_deg"):
-        value = getattr(config, name)
-        if not (0 < value < 170 or (value == 0 and name == "fov_deg")):
-            raise UsageError(f"is {value}", where=f"camera.{name}", valid=["more than 0 and less than 170 degrees"])
     every = 6 if _draft("camera", config.quality) else 3
     focal, share, source = _focal(config, decoded.json["video.json"].get("focal_px_hint", 0.0), frames.shape[1:3])
     settings = CameraSettings(

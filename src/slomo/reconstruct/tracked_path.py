@@ -115,8 +115,9 @@ def track_path(
     focal: float,
     seed: int,
     turning: np.ndarray,
-) -> TrackedPath:
-    """Cameras of the frames `keys` (N,).
+) -> TrackedPath | None:
+    """Cameras of the frames `keys` (N,); None where no track is seen in three of them, which alone tells how far each
+    is from the next.
 
     Args:
         epipolar: correspondences of the tracks between these frames.
@@ -126,6 +127,8 @@ def track_path(
             agree. (One of refined focal length turns by several times as much where there is parallax.)
     """
     sightings = _Sightings(tracks, keys, center, focal, seed)
+    if len(sightings.track) == 0:
+        return None
     turns = Rotation.from_matrix(turning[0].T @ turning).as_rotvec()
     found: list[TrackedPath] = []
     for share in (1.0, 0.0, 0.5):
@@ -173,10 +176,8 @@ class _Sightings:
     """Rays of tracks that are seen in three of the frames `keys` or more."""
 
     def __init__(self, tracks: Tracks, keys: np.ndarray, center: np.ndarray, focal: float, seed: int):
-        place = np.full(int(tracks.frame.max()) + 1, -1)
-        place[keys] = np.arange(len(keys))
-        at = place[tracks.frame]
-        times = np.bincount(tracks.track[at >= 0], minlength=int(tracks.track.max()) + 1)
+        at = tracks.places(keys)
+        times = np.bincount(tracks.track[at >= 0])
         enough = np.flatnonzero(times >= 3)
         if len(enough) > _MOST_TRACKS:
             enough = np.random.default_rng(seed).choice(enough, _MOST_TRACKS, replace=False)

@@ -1,5 +1,6 @@
 """Segmenter that takes the masks which the user made."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,13 +11,16 @@ from slomo.errors import InvalidData
 from slomo.reconstruct.flow import Flow
 from slomo.reconstruct.segment import Masks, Report, no_subject
 
-_SUFFIXES = (".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg", ".webp")
+_EXACT = (".png", ".bmp", ".tif", ".tiff")
+_LOSSY = (".jpg", ".jpeg", ".webp")  # around the subject such a picture rings, so that little is nothing
 
 
 @dataclass(frozen=True)
 class UserMasks:
-    """A folder of pictures, one a frame in the order of their names, of any size (non-zero is the subject), or an npz
-    with `packed` (T, H, ceil(W/8)) as of `np.packbits` and `shape` (T, H, W). A folder that holds one npz counts as it.
+    """A folder of pictures, one a frame in the order of their names (2 before 10), of any size, or an npz with `packed`
+    (T, H, ceil(W/8)) as of `np.packbits` and `shape` (T, H, W). A folder that holds one npz counts as it.
+
+    The subject is what is not zero, in pictures that are compressed with loss what is more than half of the range.
     """
 
     path: Path
@@ -25,12 +29,12 @@ class UserMasks:
     def segment(self, frames: np.ndarray, flow: Flow, progress: Report) -> Masks:
         path = Path(self.path)
         if path.is_dir():
-            files = sorted(f for f in path.iterdir() if f.suffix.lower() in (*_SUFFIXES, ".npz"))
-            archives = [f for f in files if f.suffix.lower() == ".npz"]
+            archives = [f for f in path.iterdir() if f.suffix.lower() == ".npz"]
             if len(archives) == 1:
                 masks = _from_archive(archives[0])
             else:
-                masks = [_from_picture(f) for f in files if f.suffix.lower() in _SUFFIXES]
+                pictures = [f for f in path.iterdir() if f.suffix.lower() in (*_EXACT, *_LOSSY)]
+                masks = [_from_picture(f) for f in sorted(pictures, key=_natural)]
         else:
             masks = _from_archive(path)
         if len(masks) != len(frames):
@@ -56,6 +60,12 @@ class UserMasks:
         return Masks(out)
 
 
+def _natural(path: Path) -> tuple[list[str | int], str]:
+    """Key that sorts names by the numbers in them."""
+    parts = re.split(r"(\d+)", path.name)
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], path.name
+
+
 def _from_archive(path: Path) -> np.ndarray:
     try:
         with np.load(path, allow_pickle=False) as z:
@@ -74,6 +84,7 @@ def _from_picture(path: Path) -> np.ndarray:
     picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if picture is None:
         raise InvalidData("not a readable picture", where=path, todo="give masks as PNG")
+    least = 127 if path.suffix.lower() in _LOSSY else 0
     if picture.ndim == 3 and picture.shape[2] == 4 and not picture[..., 3].all():
-        return picture[..., 3] > 0  # drawn on transparency
-    return np.asarray(picture[..., :3].any(-1) if picture.ndim == 3 else picture > 0)
+        return picture[..., 3] > least  # drawn on transparency
+    return np.asarray((picture[..., :3] > least).any(-1) if picture.ndim == 3 else picture > least)

@@ -1,6 +1,6 @@
 """Decoding a clip into upright RGB frames on a uniform time grid."""
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +14,7 @@ from slomo.errors import InvalidData
 MIN_FRAMES = 8
 LEAST_FPS = 12.0  # frames a second of a clip that is too long to take more of: five of the fastest stride
 LEAST_SIDE = 320  # px, likewise
+_FASTER = 0.01  # a source that is faster than wanted by no more than this (30.02 fps) is taken as it is
 _DIAGONAL_35MM = 43.267  # mm, diagonal of the full frame that "35 mm equivalent" focal lengths refer to
 _FOCAL_TAG = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
 
@@ -43,12 +44,13 @@ def decode(
     megapixels: float = 280.0,
     progress=lambda fraction: None,
 ) -> Clip:
-    """Decode `path`, resampling to at most `fps` by the nearest source frame and shrinking to `max_side` px.
+    """Decode `path`, resampling to at most `fps` and shrinking to `max_side` px.
 
     Args:
         start: s from the clip's first frame.
         duration: s; 0 means up to the end.
-        fps: upper bound of the frame rate; a slower source keeps its own.
+        fps: upper bound of the frame rate. A slower source keeps its own; of a faster one every n-th frame is taken if
+            its rate is constant, else the frames nearest to a grid at `fps`.
         megapixels: million pixels of all frames together, the bound on memory; see `fit_in`.
 
     Raises:
@@ -56,47 +58,53 @@ def decode(
     """
     path = Path(path)
     if not path.is_file():
-        raise InvalidData("no such file", where=path, todo="give a video file")
+        what = "is a folder" if path.is_dir() else "no such file"
+        raise InvalidData(what, where=path, todo="give a video file")
     if path.stat().st_size == 0:
         raise InvalidData("the file is empty", where=path, todo="give a video file")
-    pts, stamps_lost = _timestamps(path)
-    if len(pts) == 0:
-        raise InvalidData(
-            "the video stream holds no frames", where=path, todo="copy the clip again, it may be truncated"
-        )
-    source_fps = 1.0 / float(np.median(np.diff(pts))) if len(pts) > 1 else 0.0
+    with closing(_open(path)) as container:
+        info = _stream_info(container)
+        stream = container.streams.video[0]
+        pts = _timestamps(container, path)
+        promised, header_rate = stream.frames, float(stream.average_rate or 0)
+        header_length = float((stream.duration or 0) * (stream.time_base or 1))
+        may_hide = "mov" in container.format.name  # MP4 as well
+    source_fps, periods = _frame_rate(pts, header_rate)
     rate = min(source_fps, fps)
     length = float(pts[-1] - pts[0]) + (1.0 / source_fps if source_fps else 0.0)
+    if periods:
+        # On a grid of another rate some steps would be longer than others, and so would be the speeds seen in them.
+        rate = source_fps / max(1, int(np.ceil(source_fps / fps - _FASTER)))
+        length = periods / source_fps
     stop = min(length, start + duration) if duration > 0 else length
     wanted = int(np.floor((stop - start) * rate + 1e-6)) if stop > start else 0
     _require_enough(wanted, path, f"the clip lasts {length:.2f} s, {max(stop - start, 0):.2f} s of it were asked for")
+    if periods:  # at the time of a frame: halfway between two now the one would be the nearest, now the other
+        start = round(start * source_fps) / source_fps
 
-    with closing(_open(path)) as container:
-        stream = container.streams.video[0]
-        info = _stream_info(container, stream)
-        if start > 1.0:  # land on the key frame before the start
-            container.seek(int((float(pts[0]) + start - 0.5) / float(stream.time_base or 1)), stream=stream)
-        aspect = float(stream.sample_aspect_ratio or 0) or 1.0
-        every, side, kept = fit_in(wanted, rate, (stream.width * aspect, stream.height), max_side, megapixels)
-        rate /= every
-        grid = start + np.arange(kept) / rate
-        stack, count, rotation = _fill(grid, _frames(stream, float(pts[0])), 1.0 / rate, aspect, side, progress)
+    size = (info["source_width"] * info["pixel_aspect"], info["source_height"])
+    every, side, kept = fit_in(wanted, rate, size, max_side, megapixels)
+    rate /= every
+    grid = start + np.arange(kept) / rate
+    with closing(_frames(path, float(pts[0]), start)) as frames:
+        stack, late, rotation = _fill(grid, frames, 1.0 / rate, info["pixel_aspect"], side, progress)
+    count = len(stack)
     _require_enough(count, path, f"only {count} frames could be decoded")
-    lost = stamps_lost + len(grid) - count
-    stack = stack[:count]
+    lost = max(0, promised - len(pts))
+    if may_hide:  # what an edit list hides counts among the frames that the header promises, but not in its length
+        lost = min(lost, max(0, round((header_length - length) * source_fps)))
     info |= {
         "fps": rate,
         "source_fps": source_fps,
         "width": int(stack.shape[2]),
         "height": int(stack.shape[1]),
         "rotation": rotation,
-        "frames_total": len(stack),
-        "frames_lost": int(lost),
+        "frames_total": count,
+        "frames_lost": lost + kept - count,
         "frames_dropped": (wanted + every - 1) // every - kept,
         "every": every,
         "max_side": side,
-        "start_s": start,
-        "scale": float(max(stack.shape[1:3]) / max(info["source_width"], info["source_height"])),
+        "start_s": start + late / rate,
     }
     if info["focal_35mm"]:
         info["focal_px_hint"] = info["focal_35mm"] / _DIAGONAL_35MM * float(np.hypot(*stack.shape[1:3]))
@@ -149,23 +157,71 @@ def _open(path: Path):
     return container
 
 
-def _timestamps(path: Path) -> tuple[np.ndarray, int]:
-    """Presentation times of all packets (s, sorted), without decoding, and how many frames the header promises more."""
-    with closing(_open(path)) as container:
-        stream = container.streams.video[0]
-        stamps = []
-        try:
-            for packet in container.demux(stream):
-                stamp = packet.pts if packet.pts is not None else packet.dts
-                if packet.size and stamp is not None and not packet.is_corrupt:
+def _timestamps(container, path: Path) -> np.ndarray:
+    """Presentation times of all packets that are shown (s, sorted), without decoding.
+
+    Raises:
+        InvalidData: there are none.
+    """
+    stream = container.streams.video[0]
+    stamps, untimed = [], 0
+    try:
+        for packet in container.demux(stream):
+            stamp = packet.pts if packet.pts is not None else packet.dts
+            # An edit list (a trimmed clip) hides what is only there to decode the rest.
+            if packet.size and not packet.is_corrupt and not packet.is_discard:
+                if stamp is None:
+                    untimed += 1
+                else:
                     stamps.append(stamp * float(stream.time_base or 1))
-        except av.error.FFmpegError:
-            pass  # what follows the damage cannot be read; the frames before it can
-        return np.unique(stamps), max(0, stream.frames - len(stamps))
+    except av.error.FFmpegError:
+        pass  # what follows the damage cannot be read; the frames before it can
+    if stamps:
+        return np.unique(stamps)
+    if untimed:  # counting them would need a frame rate, and that of a raw stream's header is a guess
+        todo = f"give them at the rate they were taken with, for example ffmpeg -r 30 -i {path.name} {path.stem}.mp4"
+        raise InvalidData("is a raw stream, its frames have no times", where=path, todo=todo)
+    raise InvalidData("the video stream holds no frames", where=path, todo="copy the clip again, it may be truncated")
 
 
-def _frames(stream, origin: float) -> Iterator[tuple[float, av.VideoFrame]]:
-    """Decoded frames with their time (s from the clip's first frame); damaged packets are skipped."""
+def _frame_rate(pts: np.ndarray, header: float) -> tuple[float, int]:
+    """Frames a second, and how many periods the clip lasts where the rate is constant (frames may be missing), else 0.
+
+    Args:
+        pts: (n,) s, sorted.
+        header: frames a second that the container states, 0 where it states none.
+    """
+    if len(pts) < 2:
+        return 0.0, 0
+    typical = float(np.median(np.diff(pts)))
+    number = np.cumsum(np.round(np.diff(pts) / typical))
+    # The header's rate is the exact one if the times agree with it. Those of Matroska are whole milliseconds: 17 for
+    # a sixtieth of a second, and at 240 fps almost a quarter of a period off.
+    for rate in (header, float(number[-1] / (pts[-1] - pts[0]))):
+        if rate and np.abs((pts[1:] - pts[0]) * rate - number).max() < 0.25:
+            return rate, int(number[-1]) + 1
+    return 1.0 / typical, 0
+
+
+def _frames(path: Path, origin: float, start: float) -> Generator[tuple[float, av.VideoFrame], None, None]:
+    """Decoded frames with their time (s from the clip's first frame), from one at `start` or before it."""
+    if start > 1.0:
+        with closing(_open(path)) as container:
+            stream = container.streams.video[0]
+            container.seek(int((origin + start - 0.5) / float(stream.time_base or 1)), stream=stream)
+            frames = _decoded(stream, origin)
+            first = next(frames, None)
+            # Without an index (MPEG-TS) that may be a key frame after the start, or none and so no whole picture.
+            if first and first[1].key_frame and first[0] <= start + 1e-6:
+                yield first
+                yield from frames
+                return
+    with closing(_open(path)) as container:
+        yield from _decoded(container.streams.video[0], origin)
+
+
+def _decoded(stream, origin: float) -> Iterator[tuple[float, av.VideoFrame]]:
+    """Frames from where the stream is, with their time (s from the clip's first frame); damaged packets are skipped."""
     last = -np.inf
     try:
         for packet in stream.container.demux(stream):
@@ -174,6 +230,7 @@ def _frames(stream, origin: float) -> Iterator[tuple[float, av.VideoFrame]]:
             except av.error.InvalidDataError:
                 continue
             for frame in frames:
+                # MPEG-PS does not time every frame. One before all that are timed cannot be placed and is left out.
                 time = frame.time - origin if frame.time is not None else last + 1.0 / float(stream.average_rate or 30)
                 if time > last and not frame.is_corrupt:
                     last = time
@@ -182,7 +239,8 @@ def _frames(stream, origin: float) -> Iterator[tuple[float, av.VideoFrame]]:
         return
 
 
-def _stream_info(container, stream) -> dict:
+def _stream_info(container) -> dict:
+    stream = container.streams.video[0]
     tags = {**container.metadata, **stream.metadata}
     try:
         focal = float(tags.get(_FOCAL_TAG, 0.0))
@@ -192,13 +250,15 @@ def _stream_info(container, stream) -> dict:
         "codec": stream.codec_context.name,
         "source_width": stream.width,
         "source_height": stream.height,
+        "pixel_aspect": float(stream.sample_aspect_ratio or 0) or 1.0,  # width over height of a source pixel
         "focal_35mm": focal,
     }
 
 
 def _fill(grid, frames, step: float, aspect: float, max_side: int, progress) -> tuple[np.ndarray, int, int]:
-    """The source frame nearest to each grid time, how many grid times got one, and the rotation applied (degrees)."""
-    stack, count, rotation = np.zeros((0, 0, 0, 3), np.uint8), 0, 0
+    """The source frame nearest to each grid time, as far as there are any; how many grid times before the first frame
+    are left out; and the rotation applied (degrees)."""
+    stack, count, rotation, late = np.zeros((0, 0, 0, 3), np.uint8), 0, 0, 0
     previous: tuple[float, av.VideoFrame] | None = None
 
     def take_until(limit: float):
@@ -213,13 +273,17 @@ def _fill(grid, frames, step: float, aspect: float, max_side: int, progress) -> 
             progress(count / len(grid))
 
     for time, frame in frames:
-        take_until(0.5 * (previous[0] + time) if previous else -1.0)
+        if previous:
+            take_until(0.5 * (previous[0] + time))
+        else:  # the first packets may be damaged: no copies of a later frame in their place
+            late = int(np.searchsorted(grid, time - 0.5 * step))
+            grid = grid[late:]
         previous = (time, frame)
         if count == len(grid):
             break
     if previous:  # the last frame stands for the time until the next one would have come
         take_until(previous[0] + 0.999 * step)
-    return stack, count, rotation
+    return stack[:count], late, rotation
 
 
 def _to_rgb(frame: av.VideoFrame, aspect: float, max_side: int) -> np.ndarray:
