@@ -1,6 +1,6 @@
 # make demo   sets up .venv, turns the embedded clip into a robot's motion, ends with pictures and numbers
 # make test   unit tests and an end-to-end smoke test     make check  ruff and pyright
-# make train-prior   pictures, then the networks of src/slomo/prior/weights, from nothing: within the hour on two cores
+# make train-prior   pictures, then the networks of src/slomo/prior/weights, from nothing: about an hour on two cores
 # make bench  the solvers of `slomo optimize` side by side, and with longer motions          (BENCH="--cap 60 --json")
 # make bench-mpc     one tick of the controller beside QP solvers and Fatrop             (BENCH="--minutes 10": memory, drift)
 # make bench-random  spoiled key points through retarget and optimize: verified, refused, or neither  (BENCH="--count 20")

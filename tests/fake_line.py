@@ -80,6 +80,22 @@ class Config:
     mode: str = "good"
 
 
+@dataclasses.dataclass(frozen=True)
+class TrialsConfig(Config):
+    """Those of the others, and how many."""
+
+    trials: int = 200
+    rows: tuple[str, ...] = ("none", "mass")
+    controllers: tuple[str, ...] = ("ci-mpc",)
+
+
+@dataclasses.dataclass(frozen=True)
+class ReplayConfig(Config):
+    """Those of the others, and which."""
+
+    trial: str = ""
+
+
 def run_decode(inputs: Inputs, config: DecodeConfig, progress: Progress) -> Artifact:
     content = inputs.files["clip"].read_bytes()
     if not content:
@@ -165,6 +181,7 @@ def replacements() -> dict[str, pipeline.StageSpec]:
     """The table with these stages."""
     real = {n: s for n, s in pipeline.STAGES.items() if n != "import"}
     own = {"report": {"run": "run_report"}, "evidence": {"run": "run_evidence", "config": "EvidenceConfig"}}
+    own |= {"trials": {"config": "TrialsConfig"}, "replay": {"config": "ReplayConfig"}}
     return {n: dataclasses.replace(s, module="fake_line", **own.get(n, {})) for n, s in real.items()}
 
 

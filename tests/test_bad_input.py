@@ -131,6 +131,9 @@ def test_key_points_that_are_not_finite(slomo, tmp_path):
     arrays["keypoints"][5, 2, 1] = np.nan
     np.savez(tmp_path / "nan.npz", allow_pickle=False, **arrays)
     assert "nan.npz: " in slomo(tmp_path, "import", tmp_path / "nan.npz", code=4)
+    np.savez(tmp_path / "other.npz", allow_pickle=False, t=arrays["t"], points=arrays["keypoints"])
+    said = slomo(tmp_path, "import", tmp_path / "other.npz", code=4)
+    assert "has no array 'keypoints' (it has: t, points; needed: t, keypoints, keypoint_names)" in said
 
 
 def test_robots_that_are_not_right(slomo, tmp_path):

@@ -211,7 +211,8 @@ def test_masks_given_are_used(project):
         ("[inputs]\nclip = 3", "[inputs]: clip must be a string, not 3"),
         ("[inputs]\nclp = 'a'", "no input 'clp' (valid: clip"),
         ("decode = 3", "decode stands outside any section"),
-        ("[decode", "slomo.toml: is not TOML"),
+        ("[decode", "slomo.toml: is not TOML: "),
+        ("[decode", "; correct it there, or move the file away: `slomo init` writes a new one"),
     ],
 )
 def test_a_wrong_slomo_toml(project, text, message):
@@ -238,7 +239,7 @@ def test_wrong_set_options_leave_the_file_alone(project):
     before = (project / "slomo.toml").read_text()
     for option, message in [
         ("decode.start=soon", "start = 'soon': expected a valid number"),
-        ("start=1", "--set: 'start=1' is not section.name=value"),
+        ("start=1", "--set: 'start=1' is not section.name=value; for example camera.fov_deg=60"),
         ("decode.strat=1", "no parameter 'strat'"),
         ("nonsense.x=1", "no section 'nonsense'"),
     ]:
@@ -334,7 +335,7 @@ def test_key_points_instead_of_a_clip(project):
     assert Path(run("run", points, "--robot", "go1").stdout.strip()).parent.name == "report"
     run("reconstruct", "clip.txt")
     said = run("retarget", "--robot", "go1", code=2).stderr
-    assert "both a clip and imported key points; choose with `slomo retarget --from reconstruct` or" in said
+    assert "both a clip and imported key points; choose: `slomo retarget --robot go1 --from reconstruct` or" in said
     run("retarget", "--robot", "go1", "--from", "reconstruct")
     assert "retarget: cached" in run("retarget", "--robot", "go1", "--from", points).stderr
     assert settings.read(project, list(pipeline.STAGES))["inputs"]["motion"] == "import"
@@ -428,7 +429,10 @@ def test_synth_takes_every_parameter_of_its_clip(project):
 
     options = {p.name for p in COMMANDS["synth"].params}
     assert {f.name for f in fields(Config)} <= options
-    assert "no gait 'hop' (valid: walk" in run("synth", "out", "--gait", "hop", code=2).stderr
+    said = run("synth", "out", "--gait", "hop", code=2).stderr
+    assert said.startswith("slomo: synth: no gait 'hop' (valid: walk")
+    assert "slomo: dataset: no kind 'cat' (valid" in run("dataset", "out", "--kind", "cat", code=2).stderr
+    assert not (project / "out").exists()
 
 
 def test_synth_writes_a_clip(project):

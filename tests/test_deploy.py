@@ -183,10 +183,15 @@ def test_commands_refuse_in_one_line(tmp_path):
     assert "--yes" in slomo(*deploy, "--transport", "go1-udp", "--robot-address", "192.0.2.1", code=2)
     assert "in this computer" in slomo(*deploy, "--robot-address", "192.0.2.1", "--yes", code=2)
     assert "one robot" in slomo(*deploy, "--robot-address", "224.0.0.1", "--yes", code=2)
+    # Who only listens is not asked: it goes on to what is missing.
+    address = ("--transport", "go1-udp", "--robot-address", "192.0.2.1")
+    assert "no motion yet" in slomo(*deploy, *address, "--dry-run", code=3)
     slomo(*deploy, code=3)
+    assert "no wire format for 'b1'" in slomo("deploy", "--robot", "b1", *project, *address, "--yes", code=2)
     (tmp_path / "no.log").write_text("x")
     slomo("twin", "--robot", "go1", *project, "--host", "192.0.2.1", code=2)
-    assert "valid: go1" in slomo("twin", "--robot", "g1", *project, "--port", "0", "--seconds", "0", code=2)
+    for name in ("g1", "b1"):
+        assert "valid: go1" in slomo("twin", "--robot", name, *project, "--port", "0", "--seconds", "0", code=2)
     assert not (tmp_path / "runs").exists()
 
 

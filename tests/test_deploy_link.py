@@ -147,6 +147,11 @@ def test_the_way_is_asked_about_where_it_leads_out_of_this_computer():
         check_way("go1-udp", "192.0.2.1", confirm=no, **rest)
     assert asked == ["192.0.2.1"]
     assert check_way("go1-udp", "192.0.2.1", confirm=lambda a: True, **rest).confirmed == "192.0.2.1"
+    way = check_way("go1-udp", "192.0.2.1", confirm=no, dry=True, **rest)  # it only listens
+    assert way.dry
+    assert asked == ["192.0.2.1"]
+    with pytest.raises(UsageError, match="in this computer"):
+        check_way("twin", "192.0.2.1", confirm=no, dry=True, **rest)
     with pytest.raises(UsageError, match="in this computer"):
         check_way("twin", "192.0.2.1", confirm=lambda a: True, **rest)
     with pytest.raises(UsageError, match="valid: twin, go1-udp"):

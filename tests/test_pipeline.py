@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -17,9 +18,9 @@ from typer.testing import CliRunner
 import fake_line
 from slomo import pipeline, settings
 from slomo.cli import app
+from slomo.cli.session import Session
 from slomo.errors import MissingInput, UsageError
 from slomo.pipeline import ALL, STAGES, Project
-from slomo.template import template
 
 HERE = Path(__file__).parent
 FAKE = [sys.executable, str(HERE / "fake_line.py")]
@@ -89,8 +90,8 @@ def test_every_option_of_reconstruct_is_a_parameter():
 
 
 def test_a_new_projects_file_is_read_back_as_the_defaults(tmp_path):
-    text = template({s.name: (s.module, s.config) for s in STAGES.values() if s.shares != ALL})
-    (tmp_path / settings.FILE).write_text(text)
+    Session(project_option=tmp_path, quiet=True).initialise()
+    text = (tmp_path / settings.FILE).read_text()
     assert not any(settings.read(tmp_path, list(STAGES)).values())
     uncommented = "\n".join(line.removeprefix("# ") for line in text.splitlines()[2:])
     (tmp_path / settings.FILE).write_text(uncommented)
@@ -98,8 +99,11 @@ def test_a_new_projects_file_is_read_back_as_the_defaults(tmp_path):
     for name, spec in STAGES.items():
         config = spec.of_module(spec.config)
         assert settings.make(config, tables.get(name, {}), where=name) == config()
-        if spec.shares != ALL:
-            assert set(tables.get(name, {})) == {f.name for f in dataclasses.fields(config)}
+        lender = STAGES[spec.lender].of_module(STAGES[spec.lender].config)
+        lent = {f.name for f in dataclasses.fields(lender)} if spec.shares == ALL else set()
+        assert set(tables.get(name, {})) == {f.name for f in dataclasses.fields(config)} - lent
+    assert set(tables["trials"]) == {"trials", "seed", "rows", "controllers"}
+    assert not re.search(r"see `(?!slomo )", text)  # who reads the file does not read the source
 
 
 def write_inputs(root, **inputs):

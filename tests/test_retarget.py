@@ -246,13 +246,36 @@ def test_one_unseen_shoulder_is_placed_beside_the_other():
 def test_wrong_input_is_named():
     motion = walk()
     names = tuple(n.replace("hind_left_paw", "x") for n in motion.names)
-    with pytest.raises(InvalidData, match="no key point 'hind_left_paw'"):
+    needed = "front_left_paw, front_right_paw, hind_left_paw, hind_right_paw"
+    with pytest.raises(InvalidData, match=rf"no key point 'hind_left_paw', .* \(it has: .* x.*; needed: {needed}\)"):
         retarget(replace(motion, names=names))
+    with pytest.raises(InvalidData, match=r"no key point 'nose' \(it has: hind_left_hip, "):
+        motion["nose"]
     with pytest.raises(UsageError, match="leave nothing"):
         retarget(motion, Config(start=9.0))
     exchanged = tuple(n.replace("left", "x").replace("right", "left").replace("x", "right") for n in motion.names)
     with pytest.raises(InvalidData, match="on its back most of the time; check that left and right"):
         retarget(replace(motion, names=exchanged))
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"rate": 0.0}, {"body_cutoff": -1.0}, {"foot_cutoff": 0.0}, {"max_turn_rate": 0.0}, {"scale": -1.0},
+        {"start": -0.1}, {"end": -1.0},
+    ],
+)  # fmt: skip
+def test_a_parameter_out_of_range_is_refused(given):
+    with pytest.raises(UsageError, match=rf"retarget\.{next(iter(given))}: needs a number "):
+        Config(**given)
+
+
+def test_an_unknown_limb_is_told_once():
+    for limbs, what in ((("front_left", "tail"), "no limb 'tail'"), ((), "no limb is named")):
+        with pytest.raises(UsageError) as error:
+            retarget(walk(), Config(step_height=0.05, step_limbs=limbs))
+        valid = "(valid: front_left, front_right, hind_left, hind_right)"
+        assert str(error.value) == f"retarget.step_limbs: {what} {valid}"
 
 
 def test_smoother_keeps_slow_sines_and_halves_at_the_cutoff():

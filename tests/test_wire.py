@@ -2,6 +2,7 @@
 
 import random
 import struct
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -215,9 +216,20 @@ def test_motors_are_found_by_name():
     assert got.sample.quat_xyzw is None  # zeros are no attitude
 
 
-def test_a_robot_with_other_joints_is_refused():
-    with pytest.raises(UsageError, match="valid: go1"):
-        Go1(load_robot("g1"))
+@pytest.mark.parametrize("name", ["a1", "b1", "g1"])
+def test_another_robot_is_refused(name):
+    """The A1 and the B1 have the Go1's names of joints and feet, and limits of their own."""
+    with pytest.raises(UsageError, match=rf"no wire format for '{name}' \(valid: go1\); .* begins with go1-"):
+        Go1(load_robot(name))
+
+
+def test_a_variant_of_the_go1_is_one():
+    for name in ("go1-arm", "go1_heavy"):
+        Go1(replace(load_robot("go1"), name=name))
+    with pytest.raises(UsageError, match="no wire format for 'go12'"):
+        Go1(replace(load_robot("go1"), name="go12"))
+    with pytest.raises(UsageError, match=r"go1-tall: its joints or feet are not those of a Go1 \(valid: FR_hip_joint"):
+        Go1(replace(load_robot("g1"), name="go1-tall"))
 
 
 def test_damping_is_no_torque_at_rest():

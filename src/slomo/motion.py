@@ -75,7 +75,7 @@ class KeypointMotion:
     def index(self, name: str) -> int:
         """Column of a key point. Raises `InvalidData` listing the names there are."""
         if name not in self.names:
-            raise InvalidData(f"no key point {name!r}", where="keypoint_names", valid=self.names)
+            raise InvalidData(f"no key point {name!r} (it has: {', '.join(self.names)})", where="keypoint_names")
         return self.names.index(name)
 
     def __getitem__(self, name: str) -> Array:
@@ -92,9 +92,12 @@ class KeypointMotion:
     @classmethod
     def from_arrays(cls, z: Mapping[str, Array]) -> Self:
         """Inverse of `to_arrays`; `confidence` and `contact` are optional."""
-        for key in ("t", "keypoints", "keypoint_names"):
-            if key not in z:
-                raise InvalidData(f"has no array {key!r}", where="keypoints.npz", valid=z.keys())
+        needed = ("t", "keypoints", "keypoint_names")
+        if missing := [name for name in needed if name not in z]:
+            raise InvalidData(
+                f"has no array {missing[0]!r} (it has: {', '.join(z) or 'none'}; needed: {', '.join(needed)})",
+                where="keypoints.npz",
+            )
         positions = np.asarray(z["keypoints"], float)
         return cls(
             t=np.asarray(z["t"], float),
@@ -119,7 +122,7 @@ class _Arrays:
             if f.name not in z:
                 if f.default_factory is not MISSING:
                     continue
-                raise InvalidData(f"has no array {f.name!r}", where=cls.__name__, valid=z.keys())
+                raise InvalidData(f"has no array {f.name!r} (it has: {', '.join(z) or 'none'})", where=cls.__name__)
             x = z[f.name]
             out[f.name] = str(x) if f.type in (str, "str") else tuple(map(str, x)) if f.name.endswith("names") else x
         return cls(**out)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,7 +17,6 @@ from slomo.store import SCHEMA, Manifest, Store, digest_input, digest_json, plai
 if TYPE_CHECKING:
     from slomo.robot import Robot
 
-
 ALL = ("*",)
 
 
@@ -28,10 +28,9 @@ class StageSpec:
         module, run, config, version: where the stage's function, its record of parameters and its version are.
         upstream: stages whose artifacts it takes.
         files: roles of the user's files that it takes (see `settings.INPUTS`); `optional` ones where they are given.
-        robot: whether it takes the robot.
-        inspects: whether it also takes an artifact that failed, to show it.
+        robot: whether it takes the robot.  inspects: whether it also takes an artifact that failed, to show it.
         shares: parameters that are those of the stage `lender` unless its own section sets them; `ALL` that both have.
-        command: what the user types to make its artifact.
+        command: what the user types to make its artifact; {name}: the value of one of its parameters.
     """
 
     name: str
@@ -109,11 +108,11 @@ STAGES: dict[str, StageSpec] = {
             "deploy", "slomo.deploy.stage", "deploy", upstream=("optimize", "track"), files=("deploy_log",), robot=True
         ),
         StageSpec(
-            "trials", "slomo.track.trials", "track --trials", upstream=("optimize",), robot=True, shares=ALL,
+            "trials", "slomo.track.trials", "track --trials {trials}", upstream=("optimize",), robot=True, shares=ALL,
             lender="track",
         ),
         StageSpec(
-            "replay", "slomo.report.replay", "track --replay", upstream=("optimize",), robot=True, shares=ALL,
+            "replay", "slomo.report.replay", "track --replay {trial}", upstream=("optimize",), robot=True, shares=ALL,
             lender="trials",
         ),
         StageSpec(
@@ -208,7 +207,7 @@ class Project:
             raise UsageError(
                 "the project has both a clip and imported key points",
                 where=self.root,
-                todo="choose with `slomo retarget --from reconstruct` or `--from import`",
+                todo=f"choose: `slomo retarget --robot {self.robot_name or 'R'} --from reconstruct` or `--from import`",
             )
         return given[0]
 
@@ -237,7 +236,10 @@ class Project:
 
     def command(self, stage: str) -> str:
         """What the user types to make the stage's artifact."""
-        return f"slomo {STAGES[stage].command}" + (f" --robot {self.robot_name}" if STAGES[stage].robot else "")
+        spec = STAGES[stage]
+        values = vars(spec.of_module(spec.config)()) | self.tables.get(stage, {}) if "{" in spec.command else {}
+        text = re.sub(r"{(\w+)}", lambda m: str(values.get(m[1]) or m[1].upper()), spec.command)
+        return f"slomo {text}" + (f" --robot {self.robot_name}" if spec.robot else "")
 
     def config(self, stage: str) -> Any:
         """The stage's parameters: its defaults and slomo.toml over them. Raises `UsageError`."""
@@ -290,6 +292,9 @@ class Project:
             version=spec.of_module(spec.version),
             config=plain(self.config(stage)),
             inputs={name: m["content"] for name, m in upstream.items()},
-            files={role: digest_input(path, role) for role, path in self.files(stage).items()},
+            files={
+                role: digest_input(path, role if role in spec.files else f"{role}, or do without: --set inputs.{role}=")
+                for role, path in self.files(stage).items()
+            },
             robot=self.robot.digest if spec.robot else None,
         )

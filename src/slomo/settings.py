@@ -59,7 +59,8 @@ def read(root: Path, sections: list[str]) -> Tables:
     except (FileNotFoundError, NotADirectoryError):
         return {}
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
-        raise UsageError(f"is not TOML: {e}", where=path) from None
+        todo = "correct it there, or move the file away: `slomo init` writes a new one"
+        raise UsageError(f"is not TOML: {e}", where=path, todo=todo) from None
     except OSError as e:
         raise UsageError(f"cannot be read ({e.strerror})", where=path) from None
     return merge(tables, {}, sections, where=path)
@@ -117,7 +118,7 @@ def make(config: type, table: Mapping[str, Any], *, where: object) -> Any:
     try:
         return config(**values)
     except SlomoError as e:
-        raise UsageError(str(e), where=where) from None
+        raise UsageError(str(e), where="" if e.where == str(where) else where) from None
     except (ValueError, TypeError) as e:
         raise UsageError(str(e), where=where) from None
 
@@ -143,7 +144,7 @@ def parse_set(text: str) -> tuple[str, str, Any]:
     """
     m = re.fullmatch(r"\s*(\w+)\.(\w+)\s*=(.*)", text, re.DOTALL)
     if not m:
-        raise UsageError(f"{text!r} is not section.name=value", where="--set", todo="for example camera.fov=60")
+        raise UsageError(f"{text!r} is not section.name=value", where="--set", todo="for example camera.fov_deg=60")
     section, name, value = m[1], m[2], m[3].strip()
     if not value:
         return section, name, None

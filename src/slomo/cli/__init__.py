@@ -13,7 +13,7 @@ app = typer.Typer(
     help="From a casual video of an animal or a person to a motion that a legged robot performs.\n\n"
     "\b\nslomo run cat.mp4 --robot go1\nslomo status --why\n\n"
     "Exit codes: 0 done or cached; 1 failed; 2 usage; 3 a stage's input is missing or stale; 4 the given data is "
-    "invalid; 75 locked and --no-wait; 130/143 interrupted.",
+    "invalid; 75 locked and --no-wait; 129/130/143 ended by SIGHUP, SIGINT or SIGTERM.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

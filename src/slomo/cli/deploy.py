@@ -25,12 +25,15 @@ def add_commands(app: typer.Typer) -> None:
         robot: RobotOption,
         transport: Annotated[str, typer.Option(metavar="twin|go1-udp", help="What is to be moved.")] = "twin",
         robot_address: Annotated[
-            str | None, typer.Option("--robot-address", help="Of a real robot; asks before anything is sent.")
+            str | None,
+            typer.Option("--robot-address", help="Of a real robot; asks before anything is sent, not with --dry-run."),
         ] = None,
         robot_port: PortOption = 8007,
         local_port: Annotated[int, typer.Option(min=0, max=65535, help="UDP port to send from.")] = 8080,
         yes: Annotated[bool, typer.Option("--yes", help="The address is right; do not ask.")] = False,
-        dry_run: Annotated[bool, typer.Option("--dry-run", help="Compute and log everything, send nothing.")] = False,
+        dry_run: Annotated[
+            bool, typer.Option("--dry-run", help="Compute and log everything, send nothing; from a robot only listen.")
+        ] = False,
         scrambled: ScrambledOption = False,
         realtime: RealtimeOption = True,
         from_log: Annotated[
@@ -46,12 +49,14 @@ def add_commands(app: typer.Typer) -> None:
         slomo deploy --robot go1 --dry-run
         slomo deploy --robot go1 --transport go1-udp --robot-address 192.168.123.10
         """
+        from slomo.deploy.go1 import Go1
         from slomo.deploy.run import check_way, perform
         from slomo.deploy.stops import Stops
 
         project = session.project(robot)
         stops = Stops()
         if from_log is None:
+            Go1(project.robot)  # no other robot has this wire format: told before anything is asked or compiled
             way = check_way(
                 transport, robot_address, confirm=lambda address: yes or _asked(address), port=robot_port,
                 local_port=local_port, scrambled=scrambled, dry=dry_run, realtime=realtime,

@@ -105,7 +105,8 @@ class Session:
         path = self.root / settings.FILE
         if path.is_file():
             return False
-        text = template({s.name: (s.module, s.config) for s in STAGES.values() if s.shares != ALL})
+        records = {s.name: (s.module, s.config) for s in STAGES.values()}
+        text = template(records, {s.name: s.lender for s in STAGES.values() if s.shares == ALL})
         replace_file(path, text.encode())
         self.console.note(f"new project: {path}")
         return True
@@ -116,6 +117,10 @@ class Session:
             raise InvalidData("no such file or folder", where=path, todo=f"give an existing path ({what})")
         resolved, root = path.resolve(), self.root.resolve()
         return resolved.relative_to(root).as_posix() if resolved.is_relative_to(root) else str(resolved)
+
+    def path_or_none(self, text: str, what: str) -> str | None:
+        """The same of an option that takes `none` too, which unsets the file."""
+        return None if text == "none" else self.user_path(Path(text), what)
 
     def given(self, role: str) -> bool:
         """Whether slomo.toml names the user's file for `role`."""

@@ -5,49 +5,28 @@ from typing import Annotated, Any
 
 import typer
 
+from slomo.cli.options import (
+    DurationOption,
+    FovOption,
+    Keypoints2dOption,
+    LengthOption,
+    MapOption,
+    MasksOption,
+    ModelOption,
+    PlanModelOption,
+    PriorOption,
+    QualityOption,
+    SegmenterOption,
+    SkeletonOption,
+    SolverOption,
+    StartOption,
+    TruthOption,
+    WeightsOption,
+)
 from slomo.cli.session import RobotOption, Session, command
 from slomo.cli.subject import AtOption, BoxOption, chosen_subject
 from slomo.errors import UsageError
 
-SkeletonOption = Annotated[
-    str | None,
-    typer.Option("--skeleton", metavar="auto|quadruped|human|PATH", help="Whose bones to fit; auto: the clip tells."),
-]
-SegmenterOption = Annotated[
-    str | None, typer.Option("--segmenter", metavar="auto|u2netp|still|motion|user", help="How the subject is found.")
-]
-MasksOption = Annotated[Path | None, typer.Option("--masks", metavar="DIR", help="Your own masks, one image a frame.")]
-WeightsOption = Annotated[Path | None, typer.Option("--weights", help="U2-Net-p weights (.onnx).")]
-StartOption = Annotated[float | None, typer.Option("--start", help="First second of the clip to use.")]
-DurationOption = Annotated[float | None, typer.Option("--duration", help="Seconds to use; 0: all.")]
-QualityOption = Annotated[
-    str | None, typer.Option("--quality", metavar="draft|normal|high", help="How long to work on the reconstruction.")
-]
-LengthOption = Annotated[
-    float | None, typer.Option("--length", help="Body length in metres (the clip alone cannot tell it).")
-]
-FovOption = Annotated[float | None, typer.Option("--fov", help="Horizontal field of view in degrees.")]
-PriorOption = Annotated[
-    str | None, typer.Option("--prior", metavar="auto|none|FILE", help="Network that sees parts and key points.")
-]
-Keypoints2dOption = Annotated[
-    str | None, typer.Option("--keypoints2d", metavar="FILE|none", help="Your own 2-D key points (.json).")
-]
-ModelOption = Annotated[
-    str | None, typer.Option("--keypoint-model", metavar="FILE|none", help="A key-point network of yours (.onnx).")
-]
-MapOption = Annotated[
-    Path | None, typer.Option("--keypoint-map", help="What that network takes and gives (.toml), see docs/prior.md.")
-]
-TruthOption = Annotated[
-    Path | None, typer.Option("--truth", help="truth.npz of a rendered clip: the report scores the reconstruction.")
-]
-PlanModelOption = Annotated[
-    str | None, typer.Option("--model", metavar="point-foot|whole-body", help="What the motion must be true for.")
-]
-SolverOption = Annotated[
-    str | None, typer.Option("--solver", metavar="ddp|fatrop|ipopt", help="How it is solved, see docs/solvers.md.")
-]
 KEYPOINT_SUFFIXES = (".json", ".npz")
 BUILT_IN_SKELETONS = ("auto", "quadruped", "human")
 
@@ -81,7 +60,7 @@ def _evidence(
         evidence["prior"], inputs["prior"] = None, session.user_path(Path(prior), "prior: auto, none or a file")
     for role, name in (("keypoints2d", keypoints2d), ("keypoint_model", model)):
         if name is not None:
-            inputs[role] = None if name == "none" else session.user_path(Path(name), role)
+            inputs[role] = session.path_or_none(name, role)
     if model == "none":
         inputs["keypoint_map"] = None
     elif model_map is not None:
@@ -96,8 +75,8 @@ def _from_clip(
     session: Session,
     skeleton: str | None,
     who: dict[str, Any],
-    masks: Path | None,
-    weights: Path | None,
+    masks: str | None,
+    weights: str | None,
     start: float | None,
     duration: float | None,
     length: float | None,
@@ -108,20 +87,20 @@ def _from_clip(
     """The options of `reconstruct` as entries of slomo.toml."""
     changes = _skeleton(session, skeleton)
     files = {"masks": masks, "weights": weights}
-    inputs = {role: session.user_path(path, role) for role, path in files.items() if path is not None}
+    inputs = {role: session.path_or_none(path, role) for role, path in files.items() if path is not None}
     changes["inputs"] = changes.get("inputs", {}) | inputs | evidence["inputs"]
     changes["evidence"] = evidence["evidence"]
     changes["decode"] = _given(start=start, duration=duration)
     changes["masks"] = who
-    if masks is not None:
+    if masks not in (None, "none"):
         changes["masks"].setdefault("segmenter", None)  # the default takes the masks that are given
     changes["camera"] = _given(fov_deg=fov)
     changes["reconstruct"] = changes.get("reconstruct", {}) | _given(length_m=length, quality=quality)
     return changes
 
 
-def _truth(session: Session, truth: Path | None) -> dict[str, Any]:
-    return {} if truth is None else {"truth": session.user_path(truth, "truth")}
+def _truth(session: Session, truth: str | None) -> dict[str, Any]:
+    return {} if truth is None else {"truth": session.path_or_none(truth, "truth")}
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -169,14 +148,23 @@ def add_commands(app: typer.Typer) -> None:
     @command(app, "import", runs=True)
     def import_(
         session: Session,
-        file: Annotated[Path, typer.Argument(help="keypoints.npz, or a key-point JSON of SLoMo's authors.")],
+        file: Annotated[
+            Path | None,
+            typer.Argument(
+                help="keypoints.npz (docs/retarget.md), or a key-point JSON of SLoMo's authors. "
+                "Default: the one of the last call."
+            ),
+        ] = None,
     ) -> None:
         """Key points from a file, instead of from a clip.
 
         \b
-        slomo import cat00.json
+        slomo import keypoints.npz
+        slomo import cat00.json     # one of the files that SLoMo's authors published; it does not come with slomo
         """
-        inputs = {"keypoints": session.user_path(file, "keypoints")} | session.choice_reopened("keypoints")
+        inputs: dict[str, Any] = {}
+        if file is not None:
+            inputs = {"keypoints": session.user_path(file, "keypoints")} | session.choice_reopened("keypoints")
         project = session.configure({"inputs": inputs})
         session.emit_artifact(session.runner(project).make("import"))
 
@@ -199,7 +187,7 @@ def add_commands(app: typer.Typer) -> None:
 
         \b
         slomo retarget --robot go1
-        slomo retarget --robot go1 --from dog_cpr.json
+        slomo retarget --robot go1 --from keypoints.npz
         slomo retarget --robot go1 --terrain hill.json
         """
         changes: dict[str, Any] = {}
@@ -208,7 +196,7 @@ def add_commands(app: typer.Typer) -> None:
         elif source is not None:
             changes = {"keypoints": session.user_path(Path(source), "keypoints"), "motion": "import"}
         if terrain is not None:
-            changes["terrain"] = None if terrain == "none" else session.user_path(Path(terrain), "terrain")
+            changes["terrain"] = session.path_or_none(terrain, "terrain")
         project = session.configure({"inputs": changes}, robot)
         runner = session.runner(project)
         session.emit_artifact(runner.make("retarget") if "keypoints" in changes else runner.make_only("retarget"))
@@ -241,7 +229,7 @@ def add_commands(app: typer.Typer) -> None:
 
     @command(app, "report", runs=True)
     def report(session: Session, robot: RobotOption, truth: TruthOption = None) -> None:
-        """Side-by-side video, plots and tables of what is there.
+        """Side-by-side video, plots and tables. Every stage through track must be there; a fall is shown too.
 
         \b
         slomo report --robot go1
@@ -280,7 +268,7 @@ def add_commands(app: typer.Typer) -> None:
         slomo run cat.mp4 --robot go1
         slomo run cat.mp4 --robot go1 --duration 4 --length 0.45
         slomo run two.mp4 --robot go1 --subject-box 500,200,800,420
-        slomo run cat00.json --robot go1
+        slomo run keypoints.npz --robot go1
         """
         evidence = _evidence(session, prior, keypoints2d, keypoint_model, keypoint_map)
         who = chosen_subject(segmenter, subject_at, subject_box)

@@ -56,7 +56,11 @@ def add_commands(app: typer.Typer) -> None:
             bad = [c.name for c in checks if c.needed and not c.ok]
             raise SlomoError(f"not usable: {', '.join(bad)}", where="doctor", todo="see the lines marked FAIL")
 
-    weights = typer.Typer(help="Weights of the segmentation network.", no_args_is_help=True, rich_markup_mode=None)
+    weights = typer.Typer(
+        help="Weights of the segmentation network.\n\n\b\nslomo weights fetch",
+        no_args_is_help=True,
+        rich_markup_mode=None,
+    )
     app.add_typer(weights, name="weights")
 
     @command(weights, "fetch")
@@ -76,8 +80,10 @@ def add_commands(app: typer.Typer) -> None:
         session: Session,
         out_dir: Annotated[Path, typer.Argument(help="Folder; the shards go into one for the kind below it.")],
         kind: Annotated[str | None, typer.Option(metavar="quadruped|human", help="Default: quadruped.")] = None,
-        samples: Annotated[int | None, typer.Option(help="How many pictures. Default: 6400.")] = None,
-        seed: Annotated[int | None, typer.Option(help="Of everything in it.")] = None,
+        samples: Annotated[
+            int | None, typer.Option(help="How many pictures, rounded up to whole shards of 64. Default: 6400.")
+        ] = None,
+        seed: Annotated[int | None, typer.Option(help="Of everything in it. Default: 0.")] = None,
         workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     ) -> None:
         """Labelled pictures of random animals or people, to train the prior on. Goes on where it was stopped.
@@ -86,13 +92,16 @@ def add_commands(app: typer.Typer) -> None:
         slomo dataset data --kind human --samples 640 --workers 2
         """
         from slomo import settings
-        from slomo.store import writing
-        from slomo.synth.dataset import Config, write_dataset
+        from slomo.store.files import check_writable, writing
+        from slomo.synth.dataset import SHARD, Config, write_dataset
 
         given: dict[str, Any] = dict(kind=kind, samples=samples, seed=seed)
         config = settings.make(Config, {k: v for k, v in given.items() if v is not None}, where="dataset")
+        check_writable(out_dir, named="OUT_DIR")
         session.console.start("dataset")
-        with writing(out_dir):
+        if config.samples % SHARD:
+            session.console.note(f"dataset: {config.shards * SHARD} pictures, in whole shards of {SHARD}")
+        with writing(out_dir, folder="OUT_DIR"):
             path = write_dataset(out_dir, config, _Shown(session.console), workers=workers)
         session.emit(str(path.absolute()), {"path": str(path.absolute()), "config": vars(config)})
 
@@ -109,8 +118,8 @@ def add_commands(app: typer.Typer) -> None:
                 "of a person walk, run, stand, squat, jack, wave, stretch, bend, jump. Default: walk.",
             ),
         ] = None,
-        speed: Annotated[float | None, typer.Option(help="m/s; 0: the usual speed of the gait.")] = None,
-        turn: Annotated[float | None, typer.Option(help="Degrees a second, positive to the left.")] = None,
+        speed: Annotated[float | None, typer.Option(help="m/s; 0: the usual speed of the gait. Default: 0.")] = None,
+        turn: Annotated[float | None, typer.Option(help="Degrees a second, positive to the left. Default: 0.")] = None,
         tempo: Annotated[
             str | None,
             typer.Option(
@@ -118,16 +127,20 @@ def add_commands(app: typer.Typer) -> None:
             ),
         ] = None,
         camera: Annotated[str | None, typer.Option(metavar="follow|orbit|pan|static", help="Default: follow.")] = None,
-        view: Annotated[float | None, typer.Option(help="Degrees; 0: the left flank, 90: from the front.")] = None,
-        shake: Annotated[float | None, typer.Option(help="Camera shake; 1: a hand.")] = None,
-        clutter: Annotated[bool | None, typer.Option("--clutter", help="Posts near the animal.")] = None,
-        seconds: Annotated[float | None, typer.Option(help="Length of the clip.")] = None,
-        fps: Annotated[float | None, typer.Option(help="Frames a second.")] = None,
-        width: Annotated[int | None, typer.Option(help="Pixels.")] = None,
-        height: Annotated[int | None, typer.Option(help="Pixels.")] = None,
-        noise: Annotated[float | None, typer.Option(help="Standard deviation of the sensor noise, of 255.")] = None,
-        crf: Annotated[int | None, typer.Option(help="H.264 quality; lower is better.")] = None,
-        seed: Annotated[int | None, typer.Option(help="Of the animal, the place and the hand.")] = None,
+        view: Annotated[
+            float | None, typer.Option(help="Degrees; 0: the left flank, 90: from the front. Default: 15.")
+        ] = None,
+        shake: Annotated[float | None, typer.Option(help="Camera shake; 0: none, 1: a hand. Default: 1.")] = None,
+        clutter: Annotated[bool | None, typer.Option("--clutter", help="Posts near the animal. Default: none.")] = None,
+        seconds: Annotated[float | None, typer.Option(help="Length of the clip. Default: 3.")] = None,
+        fps: Annotated[float | None, typer.Option(help="Frames a second. Default: 30.")] = None,
+        width: Annotated[int | None, typer.Option(help="Pixels, even. Default: 480.")] = None,
+        height: Annotated[int | None, typer.Option(help="Pixels, even. Default: 270.")] = None,
+        noise: Annotated[
+            float | None, typer.Option(help="Standard deviation of the sensor noise, of 255. Default: 2.")
+        ] = None,
+        crf: Annotated[int | None, typer.Option(help="H.264 quality; lower is better. Default: 22.")] = None,
+        seed: Annotated[int | None, typer.Option(help="Of the animal, the place and the hand. Default: 0.")] = None,
     ) -> None:
         """A rendered clip of an animal or a person, with its truth.
 
@@ -137,7 +150,7 @@ def add_commands(app: typer.Typer) -> None:
         slomo synth jack --animal person --gait jack --camera orbit --view 80
         """
         from slomo import settings
-        from slomo.store import writing
+        from slomo.store.files import check_writable, writing
         from slomo.synth.clip import Config, write_clip
 
         given: dict[str, Any] = dict(
@@ -145,7 +158,8 @@ def add_commands(app: typer.Typer) -> None:
             clutter=clutter, seconds=seconds, fps=fps, width=width, height=height, noise=noise, crf=crf, seed=seed,
         )  # fmt: skip
         config = settings.make(Config, {k: v for k, v in given.items() if v is not None}, where="synth")
+        check_writable(out_dir, named="OUT_DIR")
         session.console.start("synth")
-        with writing(out_dir):
+        with writing(out_dir, folder="OUT_DIR"):
             write_clip(out_dir, config, _Shown(session.console))
         session.emit(str(out_dir.absolute()), {"path": str(out_dir.absolute()), "config": vars(config)})

@@ -14,20 +14,20 @@ class Config:
     Attributes:
         listen: s, of states before anything moves.
         fold: s, from the pose in which the robot lies to a crouch.  rise: s, from there to a stand.
-        stand: s, so before the controller takes over.  blend: s, from the stand's command to the controller's.
+        stand: s, standing before the controller takes over.  blend: s, from the stand's command to the controller's.
         rest: s, after the motion's end, before the feet are set below the hips again.
         lower: s, down to a crouch.  damp: s, of damping before the end.
         stand_kp: N m/rad, stiffness of the motors in standing up and lying down.  stand_kd: N m s/rad, their damping.
         stale: s, age of the newest state from which the robot is damped.
         max_loss: fraction of the states of the last second that may be missing.
         hold: s, for which the last command is repeated when the controller is late; then the robot is damped.
-        max_tilt: degrees.
+        max_tilt: degrees, of the body.
         min_height: lowest body height over the lowest foot while standing and moving, as a fraction of the least of
             standing height and the motion's lowest.
         beyond_limit: rad, how far a joint may be outside of its limits.
         max_joint_rate: rad/s, of the joint targets.  max_torque_rate: N m/s, of the feed-forward torques.
         max_power: W, mechanical, of all motors, averaged over 0.1 s.
-        max_temperature: degrees C, of a motor.  min_battery: %.
+        max_temperature: degrees C, of a motor.  min_battery: %, of its charge.
     """
 
     listen: float = 0.5

@@ -1,5 +1,6 @@
 """What the Go1 says and is told, in the robot model's joint order and in SI units, to and from its wire format."""
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ FEET = ("FR_foot", "FL_foot", "RR_foot", "RL_foot")
 N = len(MOTOR_JOINTS)
 TICK_HZ = 1e6
 TICKS = 1 << 32
+_GO1 = re.compile(r"go1([-_]|$)")  # names of a Go1, or of a variant of it: go1-arm
 DAMPING_KD = 3.0  # N m s/rad, with which Unitree's own examples let a Go1 down
 # Slots of motors that a Go1 does not have, in which the twin reports where it truly is (see `truth`).
 _TRUTH = slice(N, N + 4)
@@ -48,14 +50,19 @@ class Go1:
     """The wire's motors and feet by name in a robot's order.
 
     Raises:
-        UsageError: the robot has other joints or feet than a Go1.
+        UsageError: the robot is no Go1.
     """
 
     def __init__(self, robot: Robot, *, scrambled: bool = False):
+        # The maker's other robots have joints and feet of the same names, and other limits: the name has to tell.
+        if not _GO1.match(robot.name):
+            raise UsageError(
+                f"no wire format for {robot.name!r}", where="--robot", valid=("go1",),
+                todo="a robot.toml of your own for a Go1 has a name that begins with go1-",
+            )  # fmt: skip
         if set(robot.joint_names) != set(MOTOR_JOINTS) or set(robot.foot_names) != set(FEET):
             raise UsageError(
-                f"no wire format for {robot.name}: its joints or feet are not those of a Go1", where="--robot",
-                valid=("go1",),
+                "its joints or feet are not those of a Go1", where=robot.name, valid=(*MOTOR_JOINTS, *FEET),
             )  # fmt: skip
         self.scrambled = scrambled
         self._motor = np.array([MOTOR_JOINTS.index(name) for name in robot.joint_names])

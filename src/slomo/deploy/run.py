@@ -70,7 +70,7 @@ class Way:
     Attributes:
         transport: "twin" (the one that listens on `port` of this computer, else one of its own) or "go1-udp".
         address, port: of the robot.  local_port: to send from; 0 for any.
-        confirmed: the address that the user has confirmed.
+        confirmed: the address that the user has confirmed, or that is only listened to (`dry`).
         scrambled: the check sum is.
         dry: nothing is sent: to a twin in virtual time, or from a robot only heard.
         realtime: ask the system for priority.
@@ -86,12 +86,14 @@ class Way:
     realtime: bool = True
 
 
-def check_way(transport: str, host: str | None, *, confirm: Callable[[str], bool], **rest: Any) -> Way:
+def check_way(
+    transport: str, host: str | None, *, confirm: Callable[[str], bool], dry: bool = False, **rest: Any
+) -> Way:
     """The way to the robot, confirmed where it leads out of this computer.
 
     Args:
         host: None for this computer.
-        confirm: asks the user about an address.
+        confirm: asks the user about an address.  dry: nothing will be sent there, so that nothing is asked.
 
     Raises:
         UsageError: an unknown transport, a host for the twin, no address, or not confirmed.
@@ -103,10 +105,10 @@ def check_way(transport: str, host: str | None, *, confirm: Callable[[str], bool
     if not is_loopback(address):
         if transport == "twin":
             raise UsageError("a twin is in this computer", where="--robot-address", todo="use --transport go1-udp")
-        if not confirm(address):
+        if not dry and not confirm(address):
             raise UsageError(f"{address} was not confirmed, nothing was sent", where="--robot-address")
         confirmed = address
-    return Way(transport=transport, address=address, confirmed=confirmed, **rest)
+    return Way(transport=transport, address=address, confirmed=confirmed, dry=dry, **rest)
 
 
 def perform(plan: Plan, way: Way, path: Path, *, stops: Stops, say: Callable[[str], None]) -> Result:

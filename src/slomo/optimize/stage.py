@@ -31,7 +31,8 @@ class Config(problem.Weights):
         dt: s, length of a step.
         mu: friction coefficient to plan with.
         kappa: N m, gap times normal force at the end of the homotopy.
-        iterations: most Newton steps for each kappa.
+        iterations: most Newton steps at the last kappa, in each round of the constraints, and 50 at each earlier one;
+            with fatrop and ipopt at every kappa.
         tolerance: relative decrease of the cost below which a solve has converged.
         solver: "ddp" (compiled, smooth contact), "fatrop" (the same problem, a check) or "ipopt" (the published form).
         strict: loaded feet do not slide at all.

@@ -75,10 +75,10 @@ def start_at_origin(paths: Footprint, trunk: Trunk, body: RobotBody) -> tuple[Fo
 
 def on_step(body: RobotBody, limbs: tuple[str, ...], names: tuple[str, ...]) -> Array:
     """(S,) bool: soles that stand on the step; `names` are the robot's limbs. Raises `UsageError`."""
-    if not limbs or any(n not in (*names, *body.soles) for n in limbs):
-        raise UsageError(
-            f"no limb {[n for n in limbs if n not in names]}", where="retarget.step_limbs", valid=(*names, *body.soles)
-        )
+    known = dict.fromkeys((*names, *body.soles))  # a quadruped's soles have the names of its limbs
+    if not limbs or any(n not in known for n in limbs):
+        what = ", ".join(f"no limb {n!r}" for n in limbs if n not in known)
+        raise UsageError(what or "no limb is named", where="retarget.step_limbs", valid=known)
     return np.array(
         [s in limbs or any(names[c] in limbs for c in p) for s, p in zip(body.soles, body.points, strict=True)]
     )

@@ -51,6 +51,14 @@ class Config:
     step_height: float = 0.0
     step_limbs: tuple[str, ...] = ("front_left", "front_right")
 
+    def __post_init__(self):
+        for name in ("rate", "body_cutoff", "foot_cutoff", "max_turn_rate"):
+            if not getattr(self, name) > 0:
+                raise UsageError(f"needs a number above 0, got {getattr(self, name)}", where=f"retarget.{name}")
+        for name in ("start", "end", "scale"):
+            if not getattr(self, name) >= 0:
+                raise UsageError(f"needs a number of at least 0, got {getattr(self, name)}", where=f"retarget.{name}")
+
 
 def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     """Key points of the creature to `keypoints.npz` (base, hips, points), `terrain.json` and `report.json`.
@@ -148,9 +156,11 @@ def _kind(source: KeypointMotion, robot: Robot) -> ModuleType:
         todo = (
             "a person's motion needs a humanoid robot" if kind is quadruped else "an animal's motion needs a quadruped"
         )
+        needed = ", ".join(kind.ends(limb)[0] for limb in kind.LIMBS)
         raise InvalidData(
-            f"no key point {kind.ends(missing[0])[0]!r}, which {robot.name} needs for its {missing[0]} limb",
-            where="key points", valid=source.names, todo=todo if fits_other else "",
+            f"no key point {kind.ends(missing[0])[0]!r}, which {robot.name} needs for its {missing[0]} limb "
+            f"(it has: {', '.join(source.names)}; needed: {needed})",
+            where="key points", todo=todo if fits_other else "",
         )  # fmt: skip
     if not any(np.any(source.confidence[:, source.index(kind.ends(limb)[0])] > 0) for limb in kind.LIMBS):
         raise InvalidData(

@@ -5,6 +5,7 @@ import errno
 import json
 import os
 import shutil
+import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -17,16 +18,38 @@ from slomo.store.digest import plain
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Turn the system's refusal to write (read-only, full, no permission) into one line."""
+def writing(path: Path, *, folder: str = "project folder with --project") -> Iterator[None]:
+    """Turn the system's refusal to write (read-only, full, no permission) into one line.
+
+    Args:
+        folder: what the user can give instead of a folder that cannot be written.
+    """
     try:
         yield
     except OSError as e:
         if e.errno in (errno.ENOSPC, errno.EDQUOT):
             todo = "free some space (`slomo gc`) and run the same command again"
         else:
-            todo = "give another project folder with --project, or make this one writable"
+            todo = f"give another {folder}, or make this one writable"
         raise SlomoError(f"cannot write ({e.strerror or e})", where=e.filename or path, todo=todo) from e
+
+
+def check_writable(folder: Path, *, named: str) -> None:
+    """See that files can be made in a folder, which need not exist yet, before long work goes there.
+
+    Args:
+        named: the argument or option that names it.
+
+    Raises:
+        SlomoError: they cannot.
+    """
+    with writing(folder, folder=named):
+        there = next(p for p in (folder.absolute(), *folder.absolute().parents) if p.exists())
+        try:
+            with tempfile.TemporaryFile(dir=there):
+                pass
+        except OSError as e:
+            raise OSError(e.errno, e.strerror, str(folder)) from None  # its name, not that of the file for the test
 
 
 def fsync_folder(folder: Path) -> None:

@@ -21,12 +21,13 @@ class Config(MpcConfig):
     """Parameters of the controller and of its test in simulation; those of the MPC are those of `mpc.MpcConfig`.
 
     Attributes:
-        horizon: as in `MpcConfig`; 0: as many steps as suit the robot's height, see `resolved`.
-        controller: "ci-mpc"; for comparison "convex-mpc" (contact schedule of the reference, see `convex_mpc`) or
-            "open-loop" (see `open_loop`).
+        horizon: how many steps the MPC looks ahead; 0: as many as suit the robot's height, 10 on a Go1.
+        controller: "ci-mpc"; for comparison "convex-mpc" (contact schedule of the reference) or "open-loop" (its joint
+            angles, by PD), see docs/trials.md.
         state: what the controller knows: "estimated" from joint encoders and IMU, or "truth", for study.
-        joint_layer: from plan to joints: "ik" (inverse kinematics, PD and J^T forces, see `joint_space`), "qp" (see
-            `whole_body_qp`) or "auto": the one that does better with that kind of robot, see `layer_of`.
+        joint_layer: from plan to joints: "ik" (inverse kinematics, PD and J^T forces), "qp" (a whole-body quadratic
+            program) or "auto": the one that does better with that kind of robot, "ik" for a quadruped, "qp" for a
+            humanoid.
         mpc_hz: 1/s, a divisor of 500. Two Newton steps a tick converge the sooner the oftener they are made: at 100 Hz
             feet move too late after a push.
         kp: N m/rad, stiffness of the motor PD.

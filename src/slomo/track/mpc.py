@@ -30,15 +30,24 @@ MODELS = ("ncp", "lcp")
 
 @dataclass(frozen=True)
 class MpcConfig:
-    """Parameters of the controller; weights as in `optimize.problem.Weights`.
+    """Parameters of the controller; weights are those of the squared deviation from the reference, as in
+    `optimize.problem.Weights`.
 
     Attributes:
         mpc_model: what it plans with. "ncp": the nonlinear dynamics (a nonlinear complementarity problem). "lcp": the
-            body linearised about the reference, only contact left as it is (see `optimize.linear_body`).
-        horizon: number of steps.  dt: s, their length.
+            body linearised about the reference, only contact left as it is.
+        horizon: number of steps.  dt: s, length of a step of the plan.
         iterations: most Newton steps a tick.  tolerance: relative decrease of the cost that ends them.
         mu: friction coefficient to plan with.  kappa: N m, smoothing of the contact.
+        position: 1/m^2, weight of the body's position.  orientation: 1/rad^2, weight of the body's orientation.
+        foot: 1/m^2, weight of the feet's places along the ground.  foot_height: 1/m^2, weight of the feet's heights.
+        velocity: s^2/m^2, weight of the body's velocity.
+        angular_velocity: s^2/rad^2, weight of the body's angular velocity.
+        foot_velocity: s^2/m^2, weight of the feet's velocities.
         effort: of the deviation from the reference's forces, as shares of the robot's weight.
+        acceleration: s^4/m^2, weight of the body's acceleration.
+        slip: s^2/m^2, weight of the speed of loaded feet along the ground.
+        slip_load: share of the robot's weight, normal force from which slip counts half.
         terminal: s, weight of the end state (as if it lasted that long).
         stride: how far, as a share of the body's height, its capture point may be off before the feet go there.
     """
