@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slomo.errors import UsageError
+from slomo.errors import StageFailed, UsageError
 from slomo.reconstruct import resection, rotation_ba, sfm
 from slomo.reconstruct.camera import estimate_camera
 from slomo.reconstruct.camera_world import GROUND_SUPPORT, GUESSED_SCALE
@@ -220,3 +220,20 @@ def test_points_above_the_camera_give_no_height(monkeypatch):
 def test_parameters_out_of_range_are_refused(name, value):
     with pytest.raises(UsageError, match=rf"camera\.{name}: is .* \(valid: \d+ to \d+\)"):
         CameraConfig(**{name: value})
+
+
+@pytest.mark.parametrize(("status", "raises"), [(-11, False), (1, True)])
+def test_a_crash_of_structure_from_motion_is_a_clip_without_a_model(monkeypatch, status: int, raises: bool):
+    monkeypatch.setattr(sfm, "_run", lambda *a: status)
+    frames, masks = np.zeros((4, 8, 8, 3), np.uint8), np.zeros((4, 8, 8), bool)
+
+    def made():
+        return sfm.reconstruct_structure(
+            frames, masks, np.arange(4), focal=10.0, refine_focal=False, features=100, overlap=3, seed=0
+        )
+
+    if raises:
+        with pytest.raises(StageFailed, match="status 1"):
+            made()
+    else:
+        assert made() is None

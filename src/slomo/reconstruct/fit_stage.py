@@ -159,7 +159,7 @@ def run_fit(inputs: Inputs, config: FitConfig, progress: Progress) -> Artifact:
     began, cpu = time.perf_counter(), time.process_time()
     made = prepare(inputs, config)
     where = chunks.bounds(made.problem.obs.t.numpy().astype(float))
-    where = chunks.with_subject(where, np.asarray(made.masks["packed"]).any((1, 2)))
+    where = chunks.with_subject(where, np.any(made.masks["packed"], axis=(1, 2)))
     with one_thread():
         run = _search(made, config, progress) if len(where) == 1 else _long(inputs, made, where, config, progress)
     report: dict[str, Any] = {

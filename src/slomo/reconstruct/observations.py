@@ -100,8 +100,8 @@ def observe(
     mask = np.stack([smaller(m) > 0.5 for m in full])
     K0 = np.asarray(camera["K"], float)
     # Pixel centres are at integers: (u + 1/2) scales, not u.
-    focal, centre = K0[[0, 1], [0, 1]] * scale, (K0[:2, 2] + 0.5) * scale - 0.5
-    K = Intrinsics(*focal.tolist(), *centre.tolist(), w, h)
+    (fx, fy), (cx, cy) = K0[[0, 1], [0, 1]] * scale, (K0[:2, 2] + 0.5) * scale - 0.5
+    K = Intrinsics(float(fx), float(fy), float(cx), float(cy), w, h)
     fl, ok = np.empty((len(at) - 1, h, w, 2), np.float32), np.empty((len(at) - 1, h, w), bool)
     for i, (first, last) in enumerate(itertools.pairwise(at.tolist())):
         total, sure = _chain(flow, first, last, (width, height))

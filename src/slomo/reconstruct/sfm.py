@@ -82,7 +82,7 @@ def reconstruct_structure(
     path: np.ndarray | None = None,
     waiting: Callable[[float], None] = lambda seconds: None,
 ) -> Structure | None:
-    """Cameras of the frames `keys` and sparse points of what is not masked; None when COLMAP finds no model.
+    """Cameras of the frames `keys` and sparse points of what is not masked; None when COLMAP finds no model or crashes.
 
     Args:
         frames: (T, H, W, 3) uint8 RGB.  masks: (T, H, W) bool, left out.
@@ -92,7 +92,7 @@ def reconstruct_structure(
         waiting: called twice a second with the seconds that it has taken; what it raises ends the process.
 
     Raises:
-        StageFailed: the process died.
+        StageFailed: the process failed.
     """
     import cv2
 
@@ -119,6 +119,8 @@ def reconstruct_structure(
         }
         (root / "job.json").write_text(json.dumps(job))
         status = _run([sys.executable, "-m", "slomo.reconstruct.colmap", folder], root / "errors.txt", waiting)
+        if status < 0:
+            return None  # it crashed, as COLMAP does on some pictures of a few textures: a clip without a model
         if status:
             last = ((root / "errors.txt").read_text().strip().splitlines() or ["no message"])[-1]
             raise StageFailed(f"structure from motion ended with status {status}: {last}", where="camera")

@@ -105,7 +105,7 @@ class _Lead:
         arrive, speed = s**2 * (3 - 2 * s), 6 * s * (1 - s) / SWING
         late, late_speed = (s**3 - s**2) * SWING, 3 * s**2 - 2 * s
         p0, w0 = reference.points[0], v0[6:].reshape(-1, 3)
-        for c in np.flatnonzero(lifted):
+        for c in np.flatnonzero(lifted).tolist():
             ground, end = _ground(model, c, lifted, (q[0] + q0) / 2, p0, standing, terrain), p0[c]
             points[:, c] = ground + arrive[:, None] * (end - ground)
             speeds[:, c] = speed[:, None] * (end - ground)
