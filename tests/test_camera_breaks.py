@@ -1,5 +1,7 @@
 """Clips that the camera is hard to follow through: blank frames, cuts, key frames with nothing in common, no ground."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -224,7 +226,11 @@ def test_parameters_out_of_range_are_refused(name, value):
 
 @pytest.mark.parametrize(("status", "raises"), [(-11, False), (1, True)])
 def test_a_crash_of_structure_from_motion_is_a_clip_without_a_model(monkeypatch, status: int, raises: bool):
-    monkeypatch.setattr(sfm, "_run", lambda *a: status)
+    def ended(command: list[str], errors: Path, waiting: object) -> int:
+        errors.write_text("no memory")
+        return status
+
+    monkeypatch.setattr(sfm, "_run", ended)
     frames, masks = np.zeros((4, 8, 8, 3), np.uint8), np.zeros((4, 8, 8), bool)
 
     def made():
@@ -233,7 +239,7 @@ def test_a_crash_of_structure_from_motion_is_a_clip_without_a_model(monkeypatch,
         )
 
     if raises:
-        with pytest.raises(StageFailed, match="status 1"):
+        with pytest.raises(StageFailed, match="status 1: no memory"):
             made()
     else:
         assert made() is None
