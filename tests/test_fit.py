@@ -257,6 +257,22 @@ def test_a_clip_too_large_for_the_memory_is_seen_in_fewer_frames_first(walk, mon
     assert small.scale == pytest.approx(0.5, abs=0.02)
 
 
+def test_who_goes_there_and_back_has_travelled(walk):
+    _, masks, flow = walk
+    z = {k: a.npz for k, a in _inputs(masks, flow).artifacts.items()}
+    obs = observe(
+        np.arange(T) / FPS, z["masks"]["masks.npz"], z["masks"]["flow.npz"], z["camera"]["camera.npz"], fps=FPS,
+        subject_px=60,
+    )  # fmt: skip
+    there_and_back = 2 * np.minimum(np.arange(T), T - 1 - np.arange(T))
+    skeleton = load_skeleton("quadruped")
+    once = hypotheses.root_guess(obs, skeleton)
+    again = hypotheses.root_guess(replace(obs, box=obs.box[there_and_back]), skeleton)
+    assert np.linalg.norm(again.middle[-1] - again.middle[0]) < 0.2 * again.length
+    assert once.travelled > 1.5
+    assert again.travelled > 0.6 * once.travelled  # the path is smoothed where it turns back
+
+
 def test_parts_that_disagree_are_refused(walk):
     _, masks, flow = walk
     with pytest.raises(InvalidData, match="disagree about the number of frames"):

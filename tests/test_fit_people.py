@@ -166,7 +166,7 @@ def test_who_stays_in_place_takes_no_strides(raising, monkeypatch, far: float, s
     monkeypatch.setattr(hypotheses, "gait_grid", lambda *a, **k: [hypotheses.GaitHypothesis("walk", 1.0, 0.0)])
     problem, root = raising
     middle = np.stack([far * np.sin(np.linspace(0, np.pi, T)), np.zeros(T)], 1)
-    root = replace(root, middle=middle, speed=np.full(T, 2 * far / (T / FPS)))
+    root = replace(root, middle=middle, travelled=far / root.length, speed=np.full(T, 2 * far / (T / FPS)))
     x = problem.variables(1, torch.Generator().manual_seed(0))
     guess = hypotheses.placed(problem.kin, root, np.zeros((1, T)))
     effort = fit.Effort((Schedule(1, 4, 16, ()),) * len(fit.PHASES), candidates=4, phases_of_gait=2)
