@@ -278,6 +278,21 @@ def test_terms_are_the_same_every_time_and_reach_every_variable(kin: Kinematics)
     assert float(radius.abs().max()) > 0
 
 
+def test_rays_that_do_not_meet_the_body_say_nothing(kin: Kinematics):
+    config = FieldsConfig(rays=50)
+    case = _case(kin, config)
+    away = dataclasses.replace(case, guess=dataclasses.replace(case.guess, position=case.guess.position + 40.0))
+    for v in away.x.values():
+        v.requires_grad_()
+    fields = Fields(config, case.problem.obs, kin, torch.full((F, K.width * K.height, 3), 0.3))
+    state = away.state(_drawn(case))
+    values = {name: term(state) for name, term in fields.terms().items()}
+    assert len(fields.rendered(state).opacity) == 0
+    assert all(v.shape == (1,) and bool(torch.isfinite(v).all()) for v in values.values()), values
+    sum(values.values(), torch.zeros(1)).sum().backward()
+    assert all(bool(torch.isfinite(v.grad).all()) for v in away.x.values() if v.grad is not None)
+
+
 def test_a_state_is_rendered_once(kin: Kinematics, monkeypatch: pytest.MonkeyPatch):
     case = _case(kin, FieldsConfig(rays=50))
     fields = Fields(FieldsConfig(rays=50), case.problem.obs, kin, torch.zeros(F, K.width * K.height, 3))

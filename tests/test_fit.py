@@ -292,3 +292,23 @@ def test_wrong_parameters():
         ReconstructConfig(iterations=(1, 2))
     with pytest.raises(UsageError, match="draft, normal, high"):
         ReconstructConfig(quality="best")
+    with pytest.raises(UsageError, match="small, published"):
+        ReconstructConfig(networks="large")
+    with pytest.raises(UsageError, match="--skeleton PATH"):
+        ReconstructConfig(skeleton="horse.toml")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("iterations", (0,) * 5), ("fps", 0.0), ("width", 0), ("candidates", -3), ("weight_mask", -1.0), ("seed", -1)],
+)
+def test_values_out_of_range(name: str, value):
+    with pytest.raises(UsageError, match=name):
+        ReconstructConfig(**{name: value})
+
+
+def test_networks_of_the_published_size():
+    plan = ReconstructConfig(networks="published").plan()
+    assert plan.fields is not None
+    assert (plan.fields.sdf_layers, plan.fields.width, plan.fields.rays) == (8, 256, 4096)
+    assert ReconstructConfig(networks="published", quality="draft").plan().fields is None

@@ -127,7 +127,15 @@ def inputs(**files):
     flow[masks[:-1]] = (1, 0)
     packed = {"packed": np.packbits(masks, axis=-1), "shape": np.array(masks.shape), "quality": np.full(T, 0.8)}
     video = dict(
-        source_width=2 * W, source_height=2 * H, width=W, height=H, rotation=0, fps=30.0, source_fps=60.0, start_s=1.0
+        source_width=2 * W,
+        source_height=2 * H,
+        pixel_aspect=1.0,
+        width=W,
+        height=H,
+        rotation=0,
+        fps=30.0,
+        source_fps=60.0,
+        start_s=1.0,
     )
     frames = {"frames": rng.integers(0, 255, (T, H, W, 3), np.uint8), "t": np.arange(T) / 30.0}
     # It looks up into the sky: nothing follows from where the subject goes.
@@ -316,7 +324,15 @@ def test_wrong_points_of_the_user(tmp_path, text, message):
 def test_points_of_a_clip_that_is_turned_and_squeezed(tmp_path):
     """Stored 200 x 100 lying on its side; shown upright 100 x 200, decoded 40 x 100: pixels are not square."""
     video = dict(
-        source_width=200, source_height=100, width=40, height=100, rotation=-90, fps=10.0, source_fps=10.0, start_s=0.5
+        source_width=100,
+        source_height=100,
+        pixel_aspect=2.0,
+        width=40,
+        height=100,
+        rotation=-90,
+        fps=10.0,
+        source_fps=10.0,
+        start_s=0.5,
     )
     points = points_file(tmp_path / "p.json", ["nose"], [{"frame": 7, "points": [[99.5, 199.5]]}])
     frame, uv = to_decoded(load_user_keypoints(points, ["nose"]), video, where=points)

@@ -100,7 +100,7 @@ def to_decoded(user: UserKeypoints, video: Mapping[str, Any], *, where: object) 
     Raises:
         InvalidData: points far outside the picture, or all of them within its first pixel.
     """
-    size = np.array([video["source_width"], video["source_height"]], float)
+    size = np.array([video["source_width"] * video["pixel_aspect"], video["source_height"]])  # as players show it
     if round(video["rotation"] / 90) % 2:
         size = size[::-1]
     said = user.points[..., 2] > 0

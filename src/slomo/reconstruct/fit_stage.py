@@ -19,7 +19,7 @@ from slomo.reconstruct.observations import Observations, observe
 from slomo.reconstruct.problem import Problem, Schedule
 from slomo.reconstruct.run import Run, as_arrays
 from slomo.reconstruct.trajectory import Trajectory
-from slomo.skeleton import AUTO, USUAL, Skeleton, load_skeleton
+from slomo.skeleton import AUTO, USUAL, Skeleton, list_skeletons, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
 FIT_VERSION = 41
@@ -36,7 +36,7 @@ class FitConfig:
     """Parameters of the fit.
 
     Attributes:
-        skeleton: "auto" (what the clip shows), "quadruped", "human" or the path of a TOML file.
+        skeleton: "auto" (what the clip shows), "quadruped" or "human"; a file of your own is `inputs.skeleton`.
         length_m: m, withers to tail base of a quadruped, standing height of a human; 0: the skeleton's typical length.
         seed: of every random choice.
         fps: fit frames a second at most. subject_px: size of the subject in working pixels (root of its area).
@@ -90,6 +90,18 @@ class FitConfig:
             raise UsageError(f"quality is {self.quality!r}", where="quality", valid=ITERATIONS)
         if self.iterations and len(self.iterations) != len(fitting.PHASES):
             raise UsageError("needs one number for each phase", where="iterations", valid=fitting.PHASES)
+        if self.iterations and (min(self.iterations) < 0 or max(self.iterations) == 0):
+            raise UsageError("needs numbers of at least 0, one of them more", where="iterations")
+        if self.skeleton not in (AUTO, *list_skeletons()):
+            raise UsageError(
+                f"no skeleton {self.skeleton!r}", where="skeleton", valid=(AUTO, *list_skeletons()),
+                todo="a file of your own is --skeleton PATH",
+            )  # fmt: skip
+        least = dict(fps=1, subject_px=8, width=1, joint_hz=0.1, root_hz=0.1, candidates=1, gait_phases=1, seed=0)
+        least |= dict(tilt_moving_deg=1e-3, tilt_static_deg=1e-3)
+        for name, x in (least | {k: 0 for k in vars(self) if k.startswith("weight_")}).items():
+            if not getattr(self, name) >= x:
+                raise UsageError(f"is {getattr(self, name)}, needs at least {x:g}", where=name)
 
     def weights(self) -> dict[str, float]:
         return {k.removeprefix("weight_"): v for k, v in vars(self).items() if k.startswith("weight_")}

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from slomo.errors import UsageError
 from slomo.mesh import SkinnedMesh
 from slomo.reconstruct.body_colours import coloured_by_clip
 from slomo.reconstruct.body_mesh import body_mesh, field_mesh
@@ -32,13 +33,15 @@ class ReconstructConfig(FitConfig):
     """Parameters of the reconstruction: those of the fit, and of its refinement.
 
     Attributes:
-        fields: whether the neural model of the body is fitted. physics: whether the motion is drawn towards a simulated
-            one. Draft quality has neither.
+        fields: whether the neural model of the body is fitted.
+        networks: its sizes: "small", or "published" (lab4d's; many times slower on a CPU, see docs/fields.md).
+        physics: whether the motion is drawn towards a simulated one. Draft quality has neither.
         weight_colour, weight_opacity, weight_field_flow, weight_eikonal, weight_cycle, weight_background,
             weight_residual: of the terms of the fields. weight_physics: of the pull towards the simulated motion.
     """
 
     fields: bool = True
+    networks: str = "small"
     physics: bool = True
     weight_colour: float = 0.3
     weight_opacity: float = 0.05
@@ -49,14 +52,19 @@ class ReconstructConfig(FitConfig):
     weight_residual: float = 0.02
     weight_physics: float = 0.2
 
+    def __post_init__(self):
+        super().__post_init__()
+        if self.networks not in NETWORKS:
+            raise UsageError(f"no networks {self.networks!r}", where="networks", valid=NETWORKS)
+
     def plan(self) -> Plan:
         """What the refinement does at this quality."""
         done = PLANS[self.quality]
-        return replace(
-            done, fields=done.fields if self.fields else None, physics=done.physics if self.physics else None
-        )
+        fields = NETWORKS[self.networks]() if done.fields and self.fields else None
+        return replace(done, fields=fields, physics=done.physics if self.physics else None)
 
 
+NETWORKS = {"small": FieldsConfig, "published": FieldsConfig.published}
 PLANS = {
     "draft": Plan(None, None),
     "normal": Plan(FieldsConfig(), PhysicsConfig(), appearance=100, joint=200, rounds=2, render=60),
