@@ -255,6 +255,13 @@ def test_a_clip_too_large_for_the_memory_is_seen_in_fewer_frames_first(walk, mon
     assert (len(whole.at), len(half.at), len(small.at)) == (T, T // 2, T // 2)
     assert whole.scale.tolist() == half.scale.tolist() == [1.0, 1.0]
     assert small.scale == pytest.approx(0.5, abs=0.02)
+    # The sides are whole numbers of pixels, which no one scale makes of the clip's.
+    monkeypatch.setattr(observations, "MOST_PIXELS", T * 90 * 160 / 9)
+    odd = seen()
+    assert odd.scale.tolist() == [odd.K.width / 160, odd.K.height / 90]
+    assert abs(odd.scale[0] - odd.scale[1]) > 1e-3
+    assert (odd.K.fx / whole.K.fx, odd.K.fy / whole.K.fy) == pytest.approx(odd.scale.tolist())
+    assert (odd.K.cy + 0.5) / (whole.K.cy + 0.5) == pytest.approx(odd.scale[1])
 
 
 def test_who_goes_there_and_back_has_travelled(walk):
