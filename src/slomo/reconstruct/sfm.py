@@ -7,6 +7,7 @@ import contextlib
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -20,6 +21,7 @@ import numpy as np
 
 from slomo.errors import StageFailed
 
+_CRASHED = (-signal.SIGSEGV, -signal.SIGABRT)
 _PREFIX = "slomo-sfm-"  # of folders for temporary files; the id of the process that made it follows
 
 ENOUGH = 0.6  # part of the key frames that a model must hold to be used
@@ -119,8 +121,8 @@ def reconstruct_structure(
         }
         (root / "job.json").write_text(json.dumps(job))
         status = _run([sys.executable, "-m", "slomo.reconstruct.colmap", folder], root / "errors.txt", waiting)
-        if status < 0:
-            return None  # it crashed, as COLMAP does on some pictures of a few textures: a clip without a model
+        if status in _CRASHED:  # COLMAP does on some pictures of a few textures; killed is another thing
+            return None
         if status:
             last = ((root / "errors.txt").read_text().strip().splitlines() or ["no message"])[-1]
             raise StageFailed(f"structure from motion ended with status {status}: {last}", where="camera")

@@ -33,16 +33,17 @@ def with_lead_in(
             too far from the body to stand there, come from there.
     """
     lifted = _lifted(model, reference.points[0], terrain)
+    most = CROUCH * float(model.leg_max.max())
     for _ in range(model.C):
         lead = _Lead(reference, model, lifted, standing=standing, terrain=terrain, settle=settle, blend=blend)
         lower = lead.lower()
         stays = ~lifted & ~model.is_hand
         worst = int(np.where(stays, lower, 0).argmax())
         foot = _foot(model, worst)
-        if lower[worst] <= CROUCH * model.leg_max.max() or not stays[~foot].any():
+        if lower[worst] <= most or not stays[~foot].any():
             break
         lifted = lifted | foot
-    lead.sink(min(float(lower.max()), CROUCH * float(model.leg_max.max())))
+    lead.sink(min(float(lower.max()), most))
     lead.carry_hands(reference)
     h, t, q, v, points, stance = lead.h, lead.t, lead.q, lead.v, lead.points, lead.stance
     n = len(t)
