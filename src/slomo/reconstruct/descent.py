@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from slomo.reconstruct.fields import networks
 from slomo.reconstruct.fields.config import FieldsConfig
+from slomo.reconstruct.fields.device import CPU
 from slomo.reconstruct.fields.terms import Fields
 from slomo.reconstruct.physics import coupling
 from slomo.reconstruct.physics.coupling import Physics
@@ -24,7 +26,7 @@ Tensor = torch.Tensor
 
 # Shape and tilt stay: a density is never quite sharp, and a body that is free to shrink makes up for it with its size.
 POSE = ("Q", "G")
-FIELDS = "F."
+FIELDS = networks.PREFIX
 PHYSICS, NOW = "physics.", "now."  # prefixes in a checkpoint: the physics' state; variables within a step
 SURFACE = 6.0  # weight of the opacity while the pose is held, over that beside it: masks say more of skin than of bones
 WORSE = 0.02  # a step is undone when the loss of the coarse fit's own terms rises by more than this share
@@ -56,13 +58,14 @@ class Plan:
 
 
 def descend(
-    problem: Problem, run: Run, images: Tensor | None, plan: Plan, *, metres: float, seed: int, progress: Progress
-) -> Run:
+    problem: Problem, run: Run, images: Tensor | None, plan: Plan, *, metres: float, seed: int, progress: Progress,
+    device: torch.device = CPU,
+) -> Run:  # fmt: skip
     """Refine the winner of the coarse fit.
 
     Args:
         images: (F, n, 3) colours of the fit frames for the fields (`fields.background.colours`).
-        metres: wanted body length, for the physics.
+        metres: wanted body length, for the physics. device: of the fields.
 
     Returns:
         The run with refined variables, those of the fields among them (prefix `F.`), and `log["refinement"]`.
@@ -70,7 +73,9 @@ def descend(
     generator = torch.Generator().manual_seed(seed)
     saved = progress.load()
     resumed, start, adam_state = restore(saved, generator)
-    fields = Fields(plan.fields, problem.obs, problem.kin, images) if plan.fields and images is not None else None
+    fields = None
+    if plan.fields and images is not None:
+        fields = Fields(plan.fields, problem.obs, problem.kin, images, device)
     physics = Physics(problem, metres, plan.physics) if plan.physics else None
     now: Variables = {}
     if resumed is not None and saved is not None:
@@ -81,6 +86,8 @@ def descend(
     else:
         x = run.x | (fields.variables(generator) if fields else {})
         run = Run(0, x, run.guess, run.labels, run.log | {"refinement": []})
+    if fields:
+        run, now = replace(run, x=fields.placed(run.x)), fields.placed(now)
     steps = plan.steps()
     while run.phase < len(steps):
         name = steps[run.phase]
@@ -98,7 +105,7 @@ def descend(
             progress.update(done, f"{steps[run.phase]} {i}/{schedule.iterations}, loss {float(loss.min()):.3f}")
             if progress.checkpoint_due():
                 state = checkpoint(run, i, optimiser, generator)
-                state |= {f"{NOW}{k}": v.detach().numpy().copy() for k, v in x.items()}
+                state |= {f"{NOW}{k}": v.detach().cpu().numpy().copy() for k, v in x.items()}
                 progress.save(state | {f"{PHYSICS}{k}": v for k, v in held.items()})
 
         x = optimise(posed, x, run.guess, schedule, generator, start=start, adam_state=adam_state, each=each)
@@ -108,7 +115,7 @@ def descend(
         entry |= {"loss_after": round(after, 4), "kept": kept}
         run = Run(run.phase + 1, x if kept else run.x, run.guess, run.labels, run.log)
         run.log["refinement"] = [*run.log["refinement"], entry]
-    return run
+    return replace(run, x={k: v.cpu() for k, v in run.x.items()})
 
 
 def _step(

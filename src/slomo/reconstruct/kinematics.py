@@ -150,7 +150,7 @@ class Kinematics:
     def capsule_ends(self, shape: dict[str, Tensor], offset: Tensor) -> Tensor:
         """(H, C, 2, 3) ends of the capsules in their links, world units. offset (H, M, 3): as `offsets` gives them."""
         # Nothing for the link's own node, the offset for a node fixed to it.
-        ends = torch.where(self.c_own[None, :, :, None], torch.zeros(1), offset[:, self.c_nodes])
+        ends = torch.where(self.c_own[None, :, :, None], offset.new_zeros(1), offset[:, self.c_nodes])
         flesh = self.c_shift + FLESH_SPREAD * shape["flesh"][:, self.flesh_variable] * self.flesh_side
         return ends + flesh * shape["log_length"].exp()[:, None, None, None]
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
 from slomo.errors import UsageError
@@ -14,6 +15,7 @@ from slomo.reconstruct.body_mesh import body_mesh, field_mesh
 from slomo.reconstruct.descent import Plan, descend
 from slomo.reconstruct.fields.background import colours
 from slomo.reconstruct.fields.config import FieldsConfig
+from slomo.reconstruct.fields.device import AUTO, CPU, check, find, on
 from slomo.reconstruct.fields.mesh import mesh
 from slomo.reconstruct.fit_stage import FitConfig, Prepared, one_thread, prepare
 from slomo.reconstruct.observations import unpack
@@ -23,7 +25,7 @@ from slomo.reconstruct.run import Run, from_arrays
 from slomo.reconstruct.verdict import Facts, checks, verdict
 from slomo.stage import Artifact, Inputs, Progress
 
-REFINE_VERSION = 14
+REFINE_VERSION = 15
 SHORT = 0.05  # body lengths, added to bones and the skeleton's own: by how much short ones change says little
 TREMBLES = 0.1  # degrees of a camera's rotation, of which the user is told
 
@@ -34,14 +36,16 @@ class ReconstructConfig(FitConfig):
 
     Attributes:
         fields: whether the neural model of the body is fitted.
-        networks: its sizes: "small", or "published" (lab4d's; many times slower on a CPU, see docs/fields.md).
+        device: of that model: "auto" (a GPU where PyTorch finds one), "cpu", "cuda" or "cuda:N".
+        networks: its sizes: "small", "published" (lab4d's; hours on a CPU) or "auto": published on a GPU.
         physics: whether the motion is drawn towards a simulated one. Draft quality has neither.
         weight_colour, weight_opacity, weight_field_flow, weight_eikonal, weight_cycle, weight_background,
             weight_residual: of the terms of the fields. weight_physics: of the pull towards the simulated motion.
     """
 
     fields: bool = True
-    networks: str = "small"
+    device: str = "auto"
+    networks: str = "auto"
     physics: bool = True
     weight_colour: float = 0.3
     weight_opacity: float = 0.05
@@ -54,13 +58,16 @@ class ReconstructConfig(FitConfig):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.networks not in NETWORKS:
-            raise UsageError(f"no networks {self.networks!r}", where="networks", valid=NETWORKS)
+        check(self.device)
+        if self.networks not in (AUTO, *NETWORKS):
+            raise UsageError(f"no networks {self.networks!r}", where="networks", valid=(AUTO, *NETWORKS))
 
-    def plan(self) -> Plan:
-        """What the refinement does at this quality."""
+    def plan(self, device: torch.device = CPU) -> Plan:
+        """What the refinement does at this quality, with its fields on that device."""
         done = PLANS[self.quality]
-        fields = NETWORKS[self.networks]() if done.fields and self.fields else None
+        usual = done.fields if device.type == "cpu" else FieldsConfig.published()
+        wanted = usual if self.networks == AUTO else NETWORKS[self.networks]()
+        fields = wanted if done.fields and self.fields else None
         return replace(done, fields=fields, physics=done.physics if self.physics else None)
 
 
@@ -81,13 +88,16 @@ def run_refine(inputs: Inputs, config: ReconstructConfig, progress: Progress) ->
     began, cpu = time.perf_counter(), time.process_time()
     made = prepare(inputs, config)
     run = from_arrays(inputs.artifacts["fit"].npz["fit.npz"])
-    plan = config.plan()
+    device = find(config.device)
+    plan = config.plan(device)
     frames = np.asarray(inputs.artifacts["decode"].npz["frames.npz"]["frames"])
     with one_thread():
         images = colours(frames, made.problem.obs) if plan.fields else None
-        run = descend(made.problem, run, images, plan, metres=made.metres, seed=config.seed, progress=progress)
+        run = descend(
+            made.problem, run, images, plan, metres=made.metres, seed=config.seed, progress=progress, device=device
+        )
         outcome = assess(made.problem, run, made.metres)
-        body = _mesh(made, run, outcome, plan.fields, frames)
+        body = _mesh(made, run, outcome, plan.fields, frames, device)
     source = "length_m" if config.length_m else f"typical length of {made.skeleton.name}"
     progress.note(f"size: {made.metres:g} m from {source}; the video alone does not tell it")
     tremble = _tremble(inputs.artifacts["camera"].npz["camera.npz"]["T_world_cam"], made.problem.obs.T_world_cam)
@@ -95,7 +105,8 @@ def run_refine(inputs: Inputs, config: ReconstructConfig, progress: Progress) ->
         progress.note(f"camera: its rotation trembles by {tremble:.2f} degrees, which the background's flow takes back")
     report: dict[str, Any] = outcome.report | {
         "skeleton": made.skeleton.name, "camera_mode": made.camera_mode, "length_m": made.metres,
-        "scale_source": source, "evidence": made.evidence, "quality": config.quality, "camera_tremble_deg": tremble,
+        "scale_source": source, "evidence": made.evidence, "quality": config.quality, "device": str(device),
+        "camera_tremble_deg": tremble,
         "seconds": round(time.perf_counter() - began, 1), "cpu_seconds": round(time.process_time() - cpu, 1),
     }  # fmt: skip
     report["verdict"] = found = verdict(checks(_facts(inputs, made, run, outcome)))
@@ -128,13 +139,16 @@ def _facts(inputs: Inputs, made: Prepared, run: Run, outcome: Outcome) -> Facts:
     )
 
 
-def _mesh(made: Prepared, run: Run, outcome: Outcome, fields: FieldsConfig | None, frames: np.ndarray) -> SkinnedMesh:
+def _mesh(
+    made: Prepared, run: Run, outcome: Outcome, fields: FieldsConfig | None, frames: np.ndarray, device: torch.device
+) -> SkinnedMesh:
     """The surface of the field, or, where there is none, the skin of the capsules in the colours of the clip."""
     kin, t = made.problem.kin, made.problem.obs.t.numpy().astype(float)
     shape = {k.removeprefix("shape."): v for k, v in run.x.items() if k.startswith("shape.")}
     unit = outcome.metres_per_unit
     if fields:
-        return field_mesh(mesh(run.x, fields, kin, shape), kin, shape, outcome.body, t, metres_per_unit=unit)
+        surface = mesh(on(run.x, device), fields, on(kin, device), on(shape, device))
+        return field_mesh(surface, kin, shape, outcome.body, t, metres_per_unit=unit)
     skin = body_mesh(kin, shape, outcome.body, t, metres_per_unit=unit)
     masks = unpack(made.masks["packed"], made.masks["shape"])
     return coloured_by_clip(skin, lambda k: frames[k], lambda k: masks[k], np.asarray(made.K), outcome.T_world_cam)

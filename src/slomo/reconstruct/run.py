@@ -37,7 +37,7 @@ class Run:
 
 def as_arrays(run: Run) -> dict[str, np.ndarray]:
     """Everything of a run, as an artifact or a checkpoint holds it."""
-    out = {f"x.{k}": v.detach().numpy().copy() for k, v in run.x.items()}
+    out = {f"x.{k}": v.detach().cpu().numpy().copy() for k, v in run.x.items()}
     out |= {f"guess.{f.name}": getattr(run.guess, f.name).numpy() for f in fields(Guess)}
     meta = dict(phase=run.phase, labels=run.labels, log=run.log)
     return out | {"meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)}
@@ -63,7 +63,7 @@ def checkpoint(
     """Everything that `restore` needs to go on to the same bits."""
     out = as_arrays(run)
     for n, s in optimiser.state_dict()["state"].items():
-        out |= {f"adam.{n}.{k}": v.numpy().copy() for k, v in s.items()}
+        out |= {f"adam.{n}.{k}": v.cpu().numpy().copy() for k, v in s.items()}
     out["iteration"] = np.array(iteration)
     out["rng"] = generator.get_state().numpy()
     return out

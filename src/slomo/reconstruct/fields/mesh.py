@@ -74,7 +74,7 @@ def mesh(
             still = networks.delta(v, part[None], part.new_zeros(1, 3 * (kin.B - 1)))
             weights.append(skinning.weights(quadric[None], part[None], still)[0])
         of_capsules = torch.cat(weights)
-        of_links = of_capsules.new_zeros(len(x), kin.B).index_add(1, kin.c_link.to(x.device), of_capsules)
+        of_links = of_capsules.new_zeros(len(x), kin.B).index_add(1, kin.c_link, of_capsules)
         L = float(shape["log_length"].exp()[0])
     f = lambda y: y.cpu().numpy().astype(float)  # noqa: E731
     return BodyMesh(place * L, triangles, f(torch.cat(colours)), f(of_links), f(body.q), f(of_capsules))

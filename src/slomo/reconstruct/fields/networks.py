@@ -13,6 +13,8 @@ from slomo.reconstruct.trajectory import mlp, mlp_variables
 Tensor = torch.Tensor
 Variables = dict[str, Tensor]
 
+PREFIX = "F."
+
 
 def encode(x: Tensor, frequencies: int) -> Tensor:
     """(N, D (1 + 2 K)): x (N, D) itself and sin, cos of pi 2^k x, k < K (Mildenhall et al. 2020, eq. 4)."""

@@ -51,7 +51,7 @@ def render(s: State, config: FieldsConfig, count: int | None = None) -> Rendered
     x, kin = dict(s.x), s.kin
     shape = rest(kin, s.shape)
     last = len(s.obs.at) - 1
-    pose = (s.q[0, :, 1:] / kin.sigma[1:].to(s.q.device)).flatten(1)
+    pose = (s.q[0, :, 1:] / kin.sigma[1:]).flatten(1)
     bones = skinning.bones(kin, s.body, s.R_root, s.q, torch.cat([s.seen, (s.seen + 1).clamp(max=last)]), shape)
     r = rays.choose(s, config.rays if count is None else count)
     here, there = r.frame, r.frame + len(s.seen)

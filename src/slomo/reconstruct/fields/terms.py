@@ -1,11 +1,14 @@
 """The evidence of the fields: terms of one rendering, with the signature of all evidence (see `losses`)."""
 
+from functools import partial
+
 import torch
 
 from slomo.reconstruct.fields import networks
 from slomo.reconstruct.fields.background import Background
 from slomo.reconstruct.fields.canonical import Capsules
 from slomo.reconstruct.fields.config import FieldsConfig
+from slomo.reconstruct.fields.device import CPU, on
 from slomo.reconstruct.fields.networks import Variables
 from slomo.reconstruct.fields.render import Rendered, mean, render
 from slomo.reconstruct.kinematics import Kinematics
@@ -25,30 +28,51 @@ class Fields:
 
     Args:
         images: (F, n, 3) sRGB in [0, 1] of the fit frames, see `background.colours`.
+        device: where networks live and rays are rendered. States are given, and terms returned, on the CPU.
     """
 
-    def __init__(self, config: FieldsConfig, obs: Observations, kin: Kinematics, images: Tensor):
-        self.config, self.obs, self.kin, self.images = config, obs, kin, images
+    def __init__(
+        self, config: FieldsConfig, obs: Observations, kin: Kinematics, images: Tensor,
+        device: torch.device = CPU,
+    ):  # fmt: skip
+        self.config, self.device = config, device
+        self.obs, self.kin, self.images = on(obs, device), on(kin, device), images.to(device)
         self.background = Background(obs, config.background_frequencies)
+        self._given: State | None = None
         self._state: State | None = None
+        self._rendered_of: State | None = None
         self._rendered: Rendered | None = None
 
     def variables(self, generator: torch.Generator) -> Variables:
         """Everything the fields learn; see `networks.variables`."""
         capsules, joints = len(self.kin.c_link), self.kin.B - 1
-        return networks.variables(self.config, capsules=capsules, joints=joints, generator=generator)
+        new = networks.variables(self.config, capsules=capsules, joints=joints, generator=generator)
+        return self.placed(new)
+
+    def placed(self, x: Variables) -> Variables:
+        """All of a fit's variables, those of the fields on the device."""
+        return {k: v.to(self.device) if k.startswith(networks.PREFIX) else v for k, v in x.items()}
 
     def terms(self) -> dict[str, Term]:
         """The terms by name; all of them share the rendering of a state."""
-        return {
+        each = {
             "colour": self.colour, "opacity": self.opacity, "field_flow": self.flow, "eikonal": self.eikonal,
             "cycle": self.cycle, "background": self.behind, "residual": self.residual,
         }  # fmt: skip
+        return {name: partial(self._evaluated, term) for name, term in each.items()}
+
+    def _evaluated(self, term: Term, given: State) -> Tensor:
+        """A term of a state that is on the CPU; the state goes to the device once for all terms."""
+        if self._given is not given or self._state is None:
+            drawn = {k: on(v, self.device) for k, v in vars(given).items() if k not in ("obs", "kin", "x")}
+            own = {k: v for k, v in given.x.items() if k.startswith(networks.PREFIX)}
+            self._given, self._state = given, State(obs=self.obs, kin=self.kin, x=own, **drawn)
+        return term(self._state).to(given.u.device)
 
     def rendered(self, s: State) -> Rendered:
         """The rendering of a state, made when it is first asked for."""
-        if self._state is not s or self._rendered is None:
-            self._state, self._rendered = s, render(s, self.config)
+        if self._rendered is None or self._rendered_of is not s:
+            self._rendered_of, self._rendered = s, render(s, self.config)
         return self._rendered
 
     def _pixels(self, s: State, r: Rendered) -> tuple[Tensor, Tensor, Tensor]:
