@@ -122,6 +122,20 @@ def test_a_person_is_not_built_leaning(person: Kinematics):
         assert bool(_upright(person, q, shape) - rest > 0.9) == costs
 
 
+def test_arms_that_are_long_for_their_legs_cost_and_short_ones_do_not(person: Kinematics):
+    names = person.skeleton.names
+    assert [names[m] for m in person.of_arms] == ["left_elbow", "right_elbow", "left_wrist", "right_wrist"]
+    assert not len(Kinematics(load_skeleton("quadruped")).of_arms)
+    group = list(person.skeleton.group_names)
+    shape = person.shape_variables(5)
+    for n, (name, factor) in enumerate([("arm", 1.2), ("arm", 0.8), ("leg", 0.8), ("leg", 1.2)]):
+        k = group.index(name)
+        shape["group"][n + 1, k] = math.log(factor) / person.group_spread[k]
+    shape["log_length"][:] = torch.tensor([0.0, 0.7, 0.0, -0.3, 0.0])  # a taller person's arms are longer
+    cost = posture.short(cast(State, SimpleNamespace(kin=person, shape=shape)))
+    np.testing.assert_allclose(cost.numpy(), [0, math.log(1.2), 0, -math.log(0.8), 0], atol=1e-5)
+
+
 def _random_outline(generator: torch.Generator) -> list[torch.Tensor]:
     ends = 40 * torch.rand(4, 1, 1, 5, generator=generator, dtype=torch.float64)
     r = 1 + 4 * torch.rand(1, 1, 5, generator=generator, dtype=torch.float64)

@@ -22,7 +22,7 @@ from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import AUTO, USUAL, Skeleton, list_skeletons, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 41
+FIT_VERSION = 42
 
 AGAIN = 0.5  # share of the rates with which the winner is fitted once more, beside one with other limbs
 POLISH = 0.4  # share of the rates with which the chunks of a long clip are polished together
@@ -46,9 +46,9 @@ class FitConfig:
         candidates: hypotheses that are fitted in the gait phase, at least one without a gait for each heading that is
             left (one or two); gait_phases: phases tried of each gait.
         tilt_moving_deg, tilt_static_deg: s.d. of the given gravity for a camera that moved, and for one that did not.
-        weight_*: of the evidence; 0 switches a term off. `facing` and `upright` are for people only, `upright` and
-            `crossed` (legs) count from the phase limbs on; `view`, `keypoints`, `parts` and `surface` are what networks
-            and the user say, where they say anything.
+        weight_*: of the evidence; 0 switches a term off. `facing`, `upright` and `short` (arms) are for people only,
+            `upright` and `crossed` (legs) count from the phase limbs on; `view`, `keypoints`, `parts` and `surface` are
+            what networks and the user say, where they say anything.
     """
 
     skeleton: str = "auto"
@@ -78,6 +78,7 @@ class FitConfig:
     weight_facing: float = 0.012
     weight_crossed: float = 0.03
     weight_upright: float = 0.005
+    weight_short: float = 0.05
     weight_view: float = 0.05
     weight_keypoints: float = 0.5
     weight_parts: float = 0.25
@@ -151,7 +152,7 @@ def prepare(inputs: Inputs, config: FitConfig) -> Prepared:
     weights = config.weights()
     said = _evidence(inputs, obs, skeleton, weights)
     if skeleton.kind != "human":
-        weights["facing"] = weights["upright"] = 0.0
+        weights["facing"] = weights["upright"] = weights["short"] = 0.0
     terms = {**losses.TERMS, **(evidence_terms.terms(said) if said else {})}
     problem = Problem(obs, kin, path, weights, float(spread), terms, said)
     metres = config.length_m or skeleton.typical_length

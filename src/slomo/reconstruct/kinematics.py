@@ -117,11 +117,23 @@ class Kinematics:
         ]
         self.place = i(list(itertools.chain(*by_depth))).argsort()
         self.contacts = i(list(skeleton.contacts))
+        self.of_legs, self.of_arms = self._limbs()
         side, high = skeleton.rest()[:, 1:].T
         self.leg = float(np.mean([high[limb.swing] - high[limb.contact] for limb in skeleton.limbs]))
         number = {foot: n for n, foot in enumerate(skeleton.contacts)}
         other = {n: number.get(skeleton.mirror[foot]) for foot, n in number.items() if side[foot] > 0}
         self.pairs = i([pair for pair in other.items() if pair[1] is not None]).reshape(-1, 2)
+
+    def _limbs(self) -> tuple[Tensor, Tensor]:
+        """The nodes at the far ends of the bones of limbs that end in a contact, and of the others."""
+        legs = set()
+        for node in self.contacts.tolist():
+            while node > 0:
+                legs.add(node)
+                node = int(self.link[node])
+        bones = ((self.median == 0) & (self.median[self.link] == 0)).nonzero()[:, 0].tolist()
+        some = lambda inside: torch.tensor([m for m in bones if (m in legs) == inside], dtype=torch.long)  # noqa: E731
+        return some(True), some(False)
 
     def _upright(self) -> list[tuple[int, int]]:
         """From the root to the last joint before the head, where no pair of limbs hangs any more, and from there on."""

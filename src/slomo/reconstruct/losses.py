@@ -7,7 +7,7 @@ and of order one when the pose is off by a limb's width. A learned prior, a neur
 import torch
 
 from slomo.reconstruct import silhouette
-from slomo.reconstruct.posture import balance, crossed, facing, forward, limits, prior, smooth, upright
+from slomo.reconstruct.posture import balance, crossed, facing, forward, limits, prior, short, smooth, upright
 from slomo.reconstruct.silhouette import Outline
 from slomo.reconstruct.state import State, Term
 
@@ -167,4 +167,5 @@ def soft_lowest(height: Tensor) -> Tensor:
 TERMS: dict[str, Term] = {
     "mask": mask, "reach": reach, "flow": flow, "stance": stance, "ground": ground, "limits": limits, "smooth": smooth,
     "forward": forward, "balance": balance, "prior": prior, "facing": facing, "crossed": crossed, "upright": upright,
+    "short": short,
 }  # fmt: skip

@@ -101,6 +101,23 @@ def balance(s: State) -> Tensor:
     return e / (1 + 0.1 * e)
 
 
+def short(s: State) -> Tensor:
+    """Arms are no longer for their legs than the skeleton's: mean log of what their bones are too long by.
+
+    An arm that is fitted too long looks as long as it is seen once it is turned in depth, and one that is too short
+    never does: errors of the picture of either sign make free limbs longer, and the longer one works on it, the more.
+    (Of all directions of a bone of length L the share that looks l long is l / (L sqrt(L^2 - l^2)) dl.) Legs stand on
+    a ground that is seen, and are told by that.
+    """
+    kin = s.kin
+    length, own = kin.offsets(s.shape).norm(dim=-1), kin.offset.norm(dim=-1)
+    legs, arms = kin.of_legs, kin.of_arms
+    if not len(arms):
+        return length.new_zeros(len(length))
+    stature = (length[:, legs].sum(1) / own[legs].sum()).detach()
+    return (length[:, arms] / own[arms] / stature[:, None]).clamp(min=1).log().mean(1)
+
+
 def prior(s: State) -> Tensor:
     """Shape and camera tilt near what is known before."""
     z = [v.reshape(len(v), -1) for k, v in s.shape.items() if k != "log_length"]
