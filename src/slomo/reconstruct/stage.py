@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from slomo.errors import InvalidData, UsageError
+from slomo.reconstruct.exposure import stretch
 from slomo.reconstruct.video import decode
 from slomo.stage import Artifact, Inputs, Progress
 
-DECODE_VERSION = 3
+DECODE_VERSION = 4
 MASKS_VERSION = 23
 CAMERA_VERSION = 9
 QUALITIES = ("draft", "normal", "high")
@@ -111,25 +112,21 @@ def run_decode(inputs: Inputs, config: DecodeConfig, progress: Progress) -> Arti
         if not getattr(config, name) >= least:
             raise UsageError(f"is {getattr(config, name)}", where=f"decode.{name}", valid=[f"{least:g} and more"])
     clip = decode(
-        Path(inputs.files["clip"]),
-        start=config.start,
-        duration=config.duration,
-        fps=config.fps,
-        max_side=config.max_side,
-        megapixels=config.megapixels,
-        progress=lambda f: progress.update(f, "decoding"),
-    )
+        Path(inputs.files["clip"]), start=config.start, duration=config.duration, fps=config.fps,
+        max_side=config.max_side, megapixels=config.megapixels, progress=lambda f: progress.update(f, "decoding"),
+    )  # fmt: skip
     if lost := clip.info["frames_lost"]:
         progress.note(f"decode: the clip is damaged or cut off: {lost} frames are lost, {len(clip.t)} are used")
     if clip.info["every"] > 1:
         progress.note(f"decode: the clip is long: it is taken at {clip.info['fps']:.3g} frames a second")
-    if clip.info["max_side"] < config.max_side:
-        progress.note(
-            f"decode: the clip is very long: its frames are {clip.info['max_side']} px, not {config.max_side}"
-        )
+    if (side := clip.info["max_side"]) < config.max_side:
+        progress.note(f"decode: the clip is very long: its frames are {side} px, not {config.max_side}")
     if dropped := clip.info["frames_dropped"]:
-        seconds = dropped / clip.info["fps"]
-        progress.note(f"decode: the clip is too long: its last {seconds:.0f} s are left out (see start, duration)")
+        left_out = f"its last {dropped / clip.info['fps']:.0f} s are left out (see start, duration)"
+        progress.note(f"decode: the clip is too long: {left_out}")
+    clip.info["contrast"] = gain = stretch(clip.frames)
+    if gain > 1:
+        progress.note(f"decode: the clip is dark or hazy: its contrast is taken {gain:g} times")
     return Artifact(npz={"frames.npz": {"frames": clip.frames, "t": clip.t}}, json={"video.json": clip.info})
 
 
