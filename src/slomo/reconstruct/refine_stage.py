@@ -88,7 +88,7 @@ def run_refine(inputs: Inputs, config: ReconstructConfig, progress: Progress) ->
     began, cpu = time.perf_counter(), time.process_time()
     made = prepare(inputs, config)
     run = from_arrays(inputs.artifacts["fit"].npz["fit.npz"])
-    device = find(config.device)
+    device = find(config.device) if config.plan().fields else CPU
     plan = config.plan(device)
     frames = np.asarray(inputs.artifacts["decode"].npz["frames.npz"]["frames"])
     with one_thread():

@@ -41,7 +41,7 @@ def find(name: str) -> torch.device:
     if device.type == "cuda" and (device.index or 0) >= found:
         seen = f"finds {found} GPU{'s' if found > 1 else ''}" if found else "finds no GPU"
         built = "" if torch.version.cuda else ", and is built without CUDA: docs/fields.md says which build has it"
-        raise UsageError(f"{name}: PyTorch {seen}{built}", where="device", todo="take --device auto or cpu")
+        raise UsageError(f"{name}: PyTorch {seen}{built}", where="device", todo="take auto or cpu")
     return device
 
 
