@@ -73,8 +73,11 @@ class Elsewhere(TorchDispatchMode):
             pass  # moves
         elif func in _INDEXED:
             assert not there or isinstance(args[0], _There), f"{func}: indices on the device, values on the CPU"
+            values = [x for x in args[2:] if isinstance(x, torch.Tensor) and x.dim()]
+            assert all(isinstance(x, _There) == isinstance(args[0], _There) for x in values), f"{func}: of both devices"
         elif there:
-            here = [tuple(x.shape) for x in flat if not isinstance(x, _There) and x.dim()]
+            gathers = any(k in str(func) for k in ("cat", "stack", "gather", "index", "scatter", "where"))
+            here = [tuple(x.shape) for x in flat if not isinstance(x, _There) and (x.dim() or gathers)]
             assert not here, f"{func}: of both devices, CPU {here}"
         if asked is not None:
             kwargs["device"] = torch.device("cpu")

@@ -72,7 +72,7 @@ def test_an_interrupted_refinement_resumes_to_the_same_bits(fitted, saves: int):
     [
         ({"fields": False}, ["round 1", "round 2"]),
         ({"physics": False}, ["appearance", "fields"]),
-        ({"quality": "draft", "device": "cuda"}, []),  # which is not asked for where nothing would use it
+        ({"quality": "draft"}, []),
     ],
 )
 def test_parts_are_switched_off(fitted, off: dict, left: list[str]):

@@ -40,10 +40,17 @@ def test_a_clip_with_contrast_stays_as_it_is(low: float, high: float):
     np.testing.assert_array_equal(frames, before)
 
 
-def test_a_black_clip_is_no_error():
-    frames = np.zeros((2, 20, 30, 3), np.uint8)
+@pytest.mark.parametrize("level", [0, 128, 255])
+def test_a_clip_of_one_grey_stays_that(level: int):
+    frames = np.full((2, 20, 30, 3), level, np.uint8)
     assert stretch(frames) == MOST
-    assert frames.max() <= 10
+    assert frames.min() == frames.max() == pytest.approx(level, abs=1)
+
+
+def test_a_small_animal_before_a_plain_ground_is_no_haze():
+    frames = _frames(90, 150)
+    frames[:, 4:7, 4:7], frames[:, 4:7, 8:11] = 240, 15
+    assert stretch(frames) == 1
 
 
 def test_a_dark_clip_is_decoded_brighter_and_that_is_said(tmp_path):

@@ -2,20 +2,18 @@
 device is the stand-in of `elsewhere`."""
 
 import dataclasses
-import re
 
 import numpy as np
 import pytest
 import torch
 
 from elsewhere import DEVICE, Elsewhere
-from slomo.errors import UsageError
+from slomo.errors import StageFailed, UsageError
 from slomo.reconstruct import refine_stage
-from slomo.reconstruct.fields.config import FieldsConfig
-from slomo.reconstruct.fields.device import find, on
+from slomo.reconstruct.fields.device import VARIABLE, find, on
 from slomo.reconstruct.fit_stage import run_fit
 from slomo.reconstruct.kinematics import Kinematics
-from slomo.reconstruct.refine_stage import ReconstructConfig, run_refine
+from slomo.reconstruct.refine_stage import run_refine
 from slomo.skeleton import load_skeleton
 from slomo.stage import Inputs, Silent
 from test_descent import CONFIG, SMALL
@@ -35,13 +33,13 @@ def fitted() -> Inputs:
 @pytest.fixture(autouse=True)
 def _small(monkeypatch):
     monkeypatch.setitem(refine_stage.PLANS, "normal", SHORT)
-    # "auto" takes the published sizes there, which are not small.
-    monkeypatch.setattr(FieldsConfig, "published", lambda: SMALL.fields)
+    monkeypatch.setitem(refine_stage.NETWORKS, "small", lambda: SMALL.fields)
+    monkeypatch.delenv(VARIABLE, raising=False)
 
 
 def test_a_refinement_elsewhere_is_that_of_the_cpu_and_resumes(fitted, monkeypatch: pytest.MonkeyPatch):
     here = run_refine(fitted, CONFIG, Silent())
-    monkeypatch.setattr(refine_stage, "find", lambda name: DEVICE)
+    monkeypatch.setattr(refine_stage, "find", lambda large: DEVICE)
     first = Stops(1)  # in the step that changes fields and pose
     with Elsewhere() as elsewhere:
         there = run_refine(fitted, CONFIG, Silent())
@@ -65,6 +63,10 @@ def test_what_mixes_devices_is_found_out():
             _ = a + b
         with pytest.raises(AssertionError, match="values on the CPU"):
             _ = b[torch.zeros(1, dtype=torch.long, device=DEVICE)]
+        with pytest.raises(AssertionError, match="of both devices"):
+            a.index_put((torch.tensor([0]),), b[:1])
+        with pytest.raises(AssertionError, match="of both devices"):
+            _ = torch.stack([a.sum(), torch.tensor(1.0)])
         assert float((a * 2 + torch.tensor(1.0)).sum()) == 9
 
 
@@ -77,24 +79,47 @@ def test_a_skeletons_tables_go_along():
     assert kin.offset.device.type == "cpu"
 
 
-def test_the_device_is_a_gpu_where_there_is_one(monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU that PyTorch finds")
+def test_a_refinement_on_a_gpu_is_that_of_the_cpu_to_rounding(fitted, monkeypatch: pytest.MonkeyPatch):
+    here = run_refine(fitted, CONFIG, Silent())
+    monkeypatch.setenv(VARIABLE, "cuda")
+    there = run_refine(fitted, CONFIG, Silent())
+    points, wanted = (out.npz["keypoints.npz"]["keypoints"] for out in (there, here))
+    np.testing.assert_allclose(points, wanted, atol=1e-3)
+
+
+def test_the_device_is_a_gpu_where_there_is_one_and_networks_are_large(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    assert find("auto").type == find("cuda").type == "cuda"
-    assert find("cpu").type == "cpu"
+    assert find(large=True).type == "cuda"
+    assert find(large=False).type == "cpu"
+    monkeypatch.setenv(VARIABLE, "cuda:0")
+    assert find(large=False).type == "cuda"
+    monkeypatch.setenv(VARIABLE, "cpu")
+    assert find(large=True).type == "cpu"
+    monkeypatch.setenv(VARIABLE, "cuda:1")
     with pytest.raises(UsageError, match="finds 1 GPU"):
-        find("cuda:1")
+        find(large=True)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert find("auto").type == "cpu"
-    with pytest.raises(UsageError, match=re.escape("cuda: PyTorch finds no GPU")):
-        find("cuda")
-
-
-def test_sizes_are_the_published_ones_on_a_gpu(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.undo()
-    gpu = torch.device("cuda")
-    assert ReconstructConfig().plan().fields == FieldsConfig()
-    assert ReconstructConfig().plan(gpu).fields == FieldsConfig.published()
-    assert ReconstructConfig(networks="small").plan(gpu).fields == FieldsConfig()
+    with pytest.raises(UsageError, match="PyTorch finds no GPU"):
+        find(large=True)
+    monkeypatch.setenv(VARIABLE, "gpu")
     with pytest.raises(UsageError, match="no device 'gpu'"):
-        dataclasses.replace(CONFIG, device="gpu")
+        find(large=True)
+
+
+def test_a_gpu_is_asked_for_only_where_the_fields_would_use_it(fitted, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv(VARIABLE, "gpu")
+    out = run_refine(fitted, dataclasses.replace(CONFIG, quality="draft"), Silent())
+    assert out.json["report.json"]["device"] == "cpu"
+    with pytest.raises(UsageError, match="no device"):
+        run_refine(fitted, CONFIG, Silent())
+
+
+def test_a_gpu_with_too_little_memory_is_no_crash(fitted, monkeypatch: pytest.MonkeyPatch):
+    def full(*_, **__):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(refine_stage, "descend", full)
+    with pytest.raises(StageFailed, match="networks = small"):
+        run_refine(fitted, CONFIG, Silent())

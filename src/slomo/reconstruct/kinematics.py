@@ -125,15 +125,16 @@ class Kinematics:
         self.pairs = i([pair for pair in other.items() if pair[1] is not None]).reshape(-1, 2)
 
     def _limbs(self) -> tuple[Tensor, Tensor]:
-        """The nodes at the far ends of the bones of limbs that end in a contact, and of the others."""
+        """The nodes at the far ends of the bones of limbs that end in a contact, and of the others. A heel, say, beside
+        the contact on the same link, is of neither."""
         legs = set()
         for node in self.contacts.tolist():
             while node > 0:
                 legs.add(node)
                 node = int(self.link[node])
         bones = ((self.median == 0) & (self.median[self.link] == 0)).nonzero()[:, 0].tolist()
-        some = lambda inside: torch.tensor([m for m in bones if (m in legs) == inside], dtype=torch.long)  # noqa: E731
-        return some(True), some(False)
+        arms = [m for m in bones if m not in legs and int(self.link[m]) not in legs]
+        return torch.tensor([m for m in bones if m in legs]).long(), torch.tensor(arms).long()
 
     def _upright(self) -> list[tuple[int, int]]:
         """From the root to the last joint before the head, where no pair of limbs hangs any more, and from there on."""

@@ -110,7 +110,7 @@ def short(s: State) -> Tensor:
     a ground that is seen, and are told by that.
     """
     kin = s.kin
-    length, own = kin.offsets(s.shape).norm(dim=-1), kin.offset.norm(dim=-1)
+    length, own = kin.offsets(s.shape).norm(dim=-1), kin.offset.norm(dim=-1).clamp(min=1e-6)
     legs, arms = kin.of_legs, kin.of_arms
     if not len(arms):
         return length.new_zeros(len(length))

@@ -8,14 +8,14 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from slomo.errors import UsageError
+from slomo.errors import StageFailed, UsageError
 from slomo.mesh import SkinnedMesh
 from slomo.reconstruct.body_colours import coloured_by_clip
 from slomo.reconstruct.body_mesh import body_mesh, field_mesh
 from slomo.reconstruct.descent import Plan, descend
 from slomo.reconstruct.fields.background import colours
 from slomo.reconstruct.fields.config import FieldsConfig
-from slomo.reconstruct.fields.device import AUTO, CPU, check, find, on
+from slomo.reconstruct.fields.device import CPU, find, on
 from slomo.reconstruct.fields.mesh import mesh
 from slomo.reconstruct.fit_stage import FitConfig, Prepared, one_thread, prepare
 from slomo.reconstruct.observations import unpack
@@ -25,7 +25,7 @@ from slomo.reconstruct.run import Run, from_arrays
 from slomo.reconstruct.verdict import Facts, checks, verdict
 from slomo.stage import Artifact, Inputs, Progress
 
-REFINE_VERSION = 15
+REFINE_VERSION = 16
 SHORT = 0.05  # body lengths, added to bones and the skeleton's own: by how much short ones change says little
 TREMBLES = 0.1  # degrees of a camera's rotation, of which the user is told
 
@@ -36,16 +36,14 @@ class ReconstructConfig(FitConfig):
 
     Attributes:
         fields: whether the neural model of the body is fitted.
-        device: of that model: "auto" (a GPU where PyTorch finds one), "cpu", "cuda" or "cuda:N".
-        networks: its sizes: "small", "published" (lab4d's; hours on a CPU) or "auto": published on a GPU.
+        networks: its sizes: "small", or "published" (lab4d's, for a GPU; hours on a CPU, see docs/fields.md).
         physics: whether the motion is drawn towards a simulated one. Draft quality has neither.
         weight_colour, weight_opacity, weight_field_flow, weight_eikonal, weight_cycle, weight_background,
             weight_residual: of the terms of the fields. weight_physics: of the pull towards the simulated motion.
     """
 
     fields: bool = True
-    device: str = "auto"
-    networks: str = "auto"
+    networks: str = "small"
     physics: bool = True
     weight_colour: float = 0.3
     weight_opacity: float = 0.05
@@ -58,16 +56,13 @@ class ReconstructConfig(FitConfig):
 
     def __post_init__(self):
         super().__post_init__()
-        check(self.device)
-        if self.networks not in (AUTO, *NETWORKS):
-            raise UsageError(f"no networks {self.networks!r}", where="networks", valid=(AUTO, *NETWORKS))
+        if self.networks not in NETWORKS:
+            raise UsageError(f"no networks {self.networks!r}", where="networks", valid=NETWORKS)
 
-    def plan(self, device: torch.device = CPU) -> Plan:
-        """What the refinement does at this quality, with its fields on that device."""
+    def plan(self) -> Plan:
+        """What the refinement does at this quality."""
         done = PLANS[self.quality]
-        usual = done.fields if device.type == "cpu" else FieldsConfig.published()
-        wanted = usual if self.networks == AUTO else NETWORKS[self.networks]()
-        fields = wanted if done.fields and self.fields else None
+        fields = NETWORKS[self.networks]() if done.fields and self.fields else None
         return replace(done, fields=fields, physics=done.physics if self.physics else None)
 
 
@@ -88,16 +83,19 @@ def run_refine(inputs: Inputs, config: ReconstructConfig, progress: Progress) ->
     began, cpu = time.perf_counter(), time.process_time()
     made = prepare(inputs, config)
     run = from_arrays(inputs.artifacts["fit"].npz["fit.npz"])
-    device = find(config.device) if config.plan().fields else CPU
-    plan = config.plan(device)
+    plan = config.plan()
+    device = find(large=config.networks == "published") if plan.fields else CPU
     frames = np.asarray(inputs.artifacts["decode"].npz["frames.npz"]["frames"])
-    with one_thread():
-        images = colours(frames, made.problem.obs) if plan.fields else None
-        run = descend(
-            made.problem, run, images, plan, metres=made.metres, seed=config.seed, progress=progress, device=device
-        )
-        outcome = assess(made.problem, run, made.metres)
-        body = _mesh(made, run, outcome, plan.fields, frames, device)
+    try:
+        with one_thread():
+            images = colours(frames, made.problem.obs) if plan.fields else None
+            run = descend(
+                made.problem, run, images, plan, metres=made.metres, seed=config.seed, progress=progress, device=device
+            )
+            outcome = assess(made.problem, run, made.metres)
+            body = _mesh(made, run, outcome, plan.fields, frames, device)
+    except torch.OutOfMemoryError as e:
+        raise StageFailed(f"{device} has too little memory", where="networks", todo="take networks = small") from e
     source = "length_m" if config.length_m else f"typical length of {made.skeleton.name}"
     progress.note(f"size: {made.metres:g} m from {source}; the video alone does not tell it")
     tremble = _tremble(inputs.artifacts["camera"].npz["camera.npz"]["T_world_cam"], made.problem.obs.T_world_cam)

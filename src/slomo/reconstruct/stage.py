@@ -14,7 +14,7 @@ from slomo.reconstruct.exposure import stretch
 from slomo.reconstruct.video import decode
 from slomo.stage import Artifact, Inputs, Progress
 
-DECODE_VERSION = 4
+DECODE_VERSION = 5
 MASKS_VERSION = 23
 CAMERA_VERSION = 9
 QUALITIES = ("draft", "normal", "high")
@@ -102,7 +102,8 @@ class CameraConfig:
 
 
 def run_decode(inputs: Inputs, config: DecodeConfig, progress: Progress) -> Artifact:
-    """Decode the file "clip" into `frames.npz` (frames (T, H, W, 3) uint8 RGB, t (T,) s) and `video.json`.
+    """Decode the file "clip" into `frames.npz` (frames (T, H, W, 3) uint8 RGB, t (T,) s) and `video.json`; frames of a
+    dark or hazy clip with their contrast stretched (`exposure`).
 
     Raises:
         InvalidData: the file is no video, or too little of it can be decoded.

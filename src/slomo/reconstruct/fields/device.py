@@ -6,6 +6,7 @@ published sizes. Kinematics, silhouette and physics stay on the CPU, where their
 
 import copy
 import dataclasses
+import os
 import re
 from collections.abc import Mapping
 from typing import Any, TypeVar
@@ -17,31 +18,28 @@ from slomo.reconstruct.kinematics import Kinematics
 
 T = TypeVar("T")
 
-AUTO = "auto"
 CPU = torch.device("cpu")
-VALID = (AUTO, "cpu", "cuda", "cuda:N")
+VARIABLE = "SLOMO_DEVICE"  # of the environment: where it runs changes no more than rounding, so no parameter says it
+VALID = ("auto", "cpu", "cuda", "cuda:N")
 
 
-def check(name: str) -> None:
-    """Raise UsageError unless `name` is one of `VALID`."""
-    if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", name):
-        raise UsageError(f"no device {name!r}", where="device", valid=VALID)
-
-
-def find(name: str) -> torch.device:
-    """The device of that name; "auto" is a GPU where there is one.
+def find(large: bool) -> torch.device:
+    """The device that `SLOMO_DEVICE` names; by default a GPU where there is one and the networks are large.
 
     Raises:
-        UsageError: PyTorch finds no such GPU.
+        UsageError: no such name, or PyTorch finds no such GPU.
     """
+    name = os.environ.get(VARIABLE) or "auto"
+    if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", name):
+        raise UsageError(f"no device {name!r}", where=VARIABLE, valid=VALID)
     found = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if name == AUTO:
-        return torch.device("cuda" if found else "cpu")
+    if name == "auto":
+        return torch.device("cuda" if found and large else "cpu")
     device = torch.device(name)
     if device.type == "cuda" and (device.index or 0) >= found:
         seen = f"finds {found} GPU{'s' if found > 1 else ''}" if found else "finds no GPU"
         built = "" if torch.version.cuda else ", and is built without CUDA: docs/fields.md says which build has it"
-        raise UsageError(f"{name}: PyTorch {seen}{built}", where="device", todo="take auto or cpu")
+        raise UsageError(f"{name}: PyTorch {seen}{built}", where=VARIABLE, todo="take auto or cpu")
     return device
 
 

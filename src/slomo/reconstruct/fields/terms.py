@@ -1,5 +1,6 @@
 """The evidence of the fields: terms of one rendering, with the signature of all evidence (see `losses`)."""
 
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -36,7 +37,8 @@ class Fields:
         device: torch.device = CPU,
     ):  # fmt: skip
         self.config, self.device = config, device
-        self.obs, self.kin, self.images = on(obs, device), on(kin, device), images.to(device)
+        seen = {k: on(getattr(obs, k), device) for k in ("at", "quality", "flow", "flow_ok")}
+        self.obs, self.kin, self.images = replace(obs, **seen), on(kin, device), images.to(device)
         self.background = Background(obs, config.background_frequencies)
         self._given: State | None = None
         self._state: State | None = None
