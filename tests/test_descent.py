@@ -1,6 +1,7 @@
 """The refinement: what it may do to a fit, that it goes on to the same bits, and that each part can be switched off."""
 
 import dataclasses
+import functools
 import itertools
 
 import numpy as np
@@ -25,12 +26,17 @@ SMALL = Plan(
 CONFIG = ReconstructConfig(iterations=(6, 4, 4, 24, 6), candidates=3, gait_phases=2, fps=6)
 
 
-@pytest.fixture(scope="module")
-def fitted() -> Inputs:
+@functools.cache
+def fit_of_a_walk() -> Inputs:
     torch.set_num_threads(1)
     _, masks, flow = _walk()
     inputs = _inputs(masks, flow)
     return Inputs(artifacts={**inputs.artifacts, "fit": run_fit(inputs, CONFIG, Silent())})
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Inputs:
+    return fit_of_a_walk()
 
 
 @pytest.fixture(autouse=True)

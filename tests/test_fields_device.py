@@ -11,23 +11,19 @@ from elsewhere import DEVICE, Elsewhere
 from slomo.errors import StageFailed, UsageError
 from slomo.reconstruct import refine_stage
 from slomo.reconstruct.fields.device import VARIABLE, find, on
-from slomo.reconstruct.fit_stage import run_fit
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.refine_stage import run_refine
 from slomo.skeleton import load_skeleton
 from slomo.stage import Inputs, Silent
-from test_descent import CONFIG, SMALL
-from test_fit import Stops, _inputs, _walk
+from test_descent import CONFIG, SMALL, fit_of_a_walk
+from test_fit import Stops
 
 SHORT = dataclasses.replace(SMALL, appearance=2, joint=3, rounds=1, render=2)
 
 
 @pytest.fixture(scope="module")
 def fitted() -> Inputs:
-    torch.set_num_threads(1)
-    _, masks, flow = _walk()
-    inputs = _inputs(masks, flow)
-    return Inputs(artifacts={**inputs.artifacts, "fit": run_fit(inputs, CONFIG, Silent())})
+    return fit_of_a_walk()
 
 
 @pytest.fixture(autouse=True)
