@@ -40,10 +40,8 @@ class Fields:
         seen = {k: on(getattr(obs, k), device) for k in ("at", "quality", "flow", "flow_ok")}
         self.obs, self.kin, self.images = replace(obs, **seen), on(kin, device), images.to(device)
         self.background = Background(obs, config.background_frequencies)
-        self._given: State | None = None
-        self._state: State | None = None
-        self._rendered_of: State | None = None
-        self._rendered: Rendered | None = None
+        self._moved: tuple[State, State] | None = None  # the last state given, and that state on the device
+        self._rendered: tuple[State, Rendered] | None = None
 
     def variables(self, generator: torch.Generator) -> Variables:
         """Everything the fields learn; see `networks.variables`."""
@@ -65,17 +63,17 @@ class Fields:
 
     def _evaluated(self, term: Term, given: State) -> Tensor:
         """A term of a state that is on the CPU; the state goes to the device once for all terms."""
-        if self._given is not given or self._state is None:
+        if self._moved is None or self._moved[0] is not given:
             drawn = {k: on(v, self.device) for k, v in vars(given).items() if k not in ("obs", "kin", "x")}
             own = {k: v for k, v in given.x.items() if k.startswith(networks.PREFIX)}
-            self._given, self._state = given, State(obs=self.obs, kin=self.kin, x=own, **drawn)
-        return term(self._state).to(given.u.device)
+            self._moved = given, State(obs=self.obs, kin=self.kin, x=own, **drawn)
+        return term(self._moved[1]).to(given.u.device)
 
     def rendered(self, s: State) -> Rendered:
         """The rendering of a state, made when it is first asked for."""
-        if self._rendered is None or self._rendered_of is not s:
-            self._rendered_of, self._rendered = s, render(s, self.config)
-        return self._rendered
+        if self._rendered is None or self._rendered[0] is not s:
+            self._rendered = s, render(s, self.config)
+        return self._rendered[1]
 
     def _pixels(self, s: State, r: Rendered) -> tuple[Tensor, Tensor, Tensor]:
         """Fit frame, flat pixel and weight (R,) of the rendered rays."""
