@@ -16,7 +16,8 @@ from scipy.stats import spearmanr
 
 from mask_cases import CASES, make_case
 from slomo.errors import SlomoError
-from slomo.reconstruct.stage import DecodeConfig, MasksConfig, run_decode, run_masks, unpack
+from slomo.reconstruct.decode_stage import DecodeConfig, run_decode
+from slomo.reconstruct.stage import MasksConfig, run_masks, unpack
 from slomo.stage import Artifact, Inputs, Silent
 
 ROOT = Path(__file__).parents[1]

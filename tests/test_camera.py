@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from slomo.errors import UsageError
 from slomo.reconstruct.camera import CameraSettings, estimate_camera
+from slomo.reconstruct.decode_stage import DecodeConfig, run_decode
 from slomo.reconstruct.ground import find_ground, gravity_from_lines
 from slomo.reconstruct.resection import interpolate_poses
-from slomo.reconstruct.stage import CameraConfig, DecodeConfig, pack, run_camera, run_decode
+from slomo.reconstruct.stage import CameraConfig, pack, run_camera
 from slomo.stage import Artifact, Inputs, Silent
 
 SHARED = Path(__file__).parents[2] / "shared"

@@ -4,8 +4,8 @@ import av
 import numpy as np
 import pytest
 
+from slomo.reconstruct.decode_stage import DecodeConfig, run_decode
 from slomo.reconstruct.exposure import FLAT, FULL, MOST, stretch
-from slomo.reconstruct.stage import DecodeConfig, run_decode
 from slomo.stage import Inputs
 from test_video import Notes
 

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from slomo.errors import InvalidData, UsageError
+from slomo.reconstruct.decode_stage import DecodeConfig, run_decode
 from slomo.reconstruct.flow import dense_flow
 from slomo.reconstruct.instances_motion import SharedMotion
 from slomo.reconstruct.motion_segment import border_distance
 from slomo.reconstruct.passing import give_back_what_passes
 from slomo.reconstruct.segment import component_at, frame_certainty, frame_quality, spans
-from slomo.reconstruct.stage import DecodeConfig, MasksConfig, pack, run_decode, run_masks, unpack
+from slomo.reconstruct.stage import MasksConfig, pack, run_masks, unpack
 from slomo.reconstruct.surroundings import _staying, give_back_patches
 from slomo.reconstruct.votes import vote_over_time
 from slomo.stage import Artifact, Inputs, Silent

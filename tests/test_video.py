@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slomo.errors import InvalidData, UsageError
-from slomo.reconstruct.stage import DecodeConfig, run_decode
+from slomo.reconstruct.decode_stage import DecodeConfig, run_decode
 from slomo.reconstruct.video import decode, fit_in
 from slomo.stage import Inputs, Silent
 
@@ -95,19 +95,29 @@ def test_long_side_is_bounded(tmp_path):
     assert clip.frames.shape[1:3] == (80, 160)
 
 
+def test_small_clips_are_enlarged_where_that_fits_in(tmp_path):
+    path = write_clip(tmp_path / "a.mp4", np.arange(60) / 30)
+    for sides, options in (((96, 144), {"max_side": 144}), ((128, 192), {}), ((64, 96), {"megapixels": 1.4})):
+        clip = decode(path, **({"enlarge": 2.0} | options))
+        assert clip.frames.shape[1:3] == sides, options
+        assert len(clip.t) == 60
+        assert clip.info["every"] == 1
+        np.testing.assert_allclose(clip.frames[:, 2 * sides[0] // 3 :].mean((1, 2, 3)) / 60, clip.t, atol=0.06)
+
+
 @pytest.mark.parametrize(("seconds", "every", "side"), [(40, 1, 640), (60, 2, 640), (200, 2, 421), (1000, 2, 320)])
 def test_long_clips_fit_in(seconds, every, side):
     """4K at 30 frames a second: the rate is lowered first, then the size; only then is anything left out."""
-    got = fit_in(30 * seconds, 30.0, (3840, 2160), 640, 300.0)
+    got = fit_in(30 * seconds, 30.0, (3840, 2160), 640, 1.0, 300.0)
     assert got[:2] == (every, side)
     assert got[2] * side**2 * 9 / 16 <= 300e6
     assert got[2] == 15 * seconds * (3 - every) or (side == 320 and got[2] < 15 * seconds)
 
 
 def test_a_slow_source_is_not_thinned_below_what_a_stride_needs():
-    assert fit_in(25 * 600, 25.0, (1280, 720), 640, 300.0)[0] == 2
-    assert fit_in(20 * 600, 20.0, (1280, 720), 640, 300.0)[0] == 1
-    assert fit_in(100, 30.0, (320, 240), 640, 300.0) == (1, 640, 100)
+    assert fit_in(25 * 600, 25.0, (1280, 720), 640, 1.0, 300.0)[0] == 2
+    assert fit_in(20 * 600, 20.0, (1280, 720), 640, 1.0, 300.0)[0] == 1
+    assert fit_in(100, 30.0, (320, 240), 640, 1.0, 300.0) == (1, 320, 100)
 
 
 def test_long_clip_is_thinned_and_said(tmp_path):

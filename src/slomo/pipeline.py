@@ -73,7 +73,10 @@ _RECONSTRUCT = "slomo.reconstruct.stage"
 STAGES: dict[str, StageSpec] = {
     s.name: s
     for s in (
-        StageSpec("decode", _RECONSTRUCT, "reconstruct", "run_decode", "DecodeConfig", "DECODE_VERSION", (), ("clip",)),
+        StageSpec(
+            "decode", "slomo.reconstruct.decode_stage", "reconstruct", "run_decode", "DecodeConfig", "DECODE_VERSION",
+            (), ("clip",),
+        ),
         StageSpec(
             "masks", _RECONSTRUCT, "reconstruct", "run_masks", "MasksConfig", "MASKS_VERSION", ("decode",),
             optional=("masks", "weights"), shares=("quality",),

@@ -1,20 +1,16 @@
-"""The parts of `reconstruct`, each cached on its own: decode, masks, camera, and the fit.
+"""Parts of `reconstruct`, each cached on its own: masks and camera.
 
-Inputs by name: files "clip" (decode), "weights" and "masks" (masks); artifacts "decode", "masks".
+Inputs by name: files "weights" and "masks" (masks); artifacts "decode", "masks".
 """
 
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from slomo.errors import InvalidData, UsageError
-from slomo.reconstruct.exposure import stretch
-from slomo.reconstruct.video import decode
 from slomo.stage import Artifact, Inputs, Progress
 
-DECODE_VERSION = 5
 MASKS_VERSION = 23
 CAMERA_VERSION = 9
 QUALITIES = ("draft", "normal", "high")
@@ -23,26 +19,6 @@ SEGMENTERS = ("auto", "u2netp", "still", "motion", "user")
 _LOST = 0.05  # part of the frames without the subject, from which on the other masks are taken
 _SURE = 0.8  # mean quality over all frames, below which they are
 _MISSED, _ELSE = 0.2, 0.05  # parts of the other masks that these do not have, and of these that the others do not
-
-
-@dataclass(frozen=True)
-class DecodeConfig:
-    """What is taken from the clip.
-
-    Attributes:
-        start: s from the clip's first frame.
-        duration: s; 0 takes everything to the end.
-        fps: frames per second at most; a slower clip keeps its own rate.
-        max_side: px, the longer side of the decoded frames at most.
-        megapixels: million pixels of all frames together, the bound on memory (about 10 bytes each): a longer clip is
-            taken at a half or less of its rate, then smaller, and what is still too much is left out, which is said.
-    """
-
-    start: float = 0.0
-    duration: float = 0.0
-    fps: float = 30.0
-    max_side: int = 640
-    megapixels: float = 280.0
 
 
 @dataclass(frozen=True)
@@ -99,36 +75,6 @@ class CameraConfig:
             value = getattr(self, name)
             if not (least <= value <= most or (value == 0 and name == "fov_deg")):
                 raise UsageError(f"is {value}", where=f"camera.{name}", valid=[f"{least} to {most}"])
-
-
-def run_decode(inputs: Inputs, config: DecodeConfig, progress: Progress) -> Artifact:
-    """Decode the file "clip" into `frames.npz` (frames (T, H, W, 3) uint8 RGB, t (T,) s) and `video.json`; frames of a
-    dark or hazy clip with their contrast stretched (`exposure`).
-
-    Raises:
-        InvalidData: the file is no video, or too little of it can be decoded.
-        UsageError: a parameter is out of its range.
-    """
-    for name, least in (("start", 0.0), ("duration", 0.0), ("fps", 1.0), ("max_side", 64), ("megapixels", 1.0)):
-        if not getattr(config, name) >= least:
-            raise UsageError(f"is {getattr(config, name)}", where=f"decode.{name}", valid=[f"{least:g} and more"])
-    clip = decode(
-        Path(inputs.files["clip"]), start=config.start, duration=config.duration, fps=config.fps,
-        max_side=config.max_side, megapixels=config.megapixels, progress=lambda f: progress.update(f, "decoding"),
-    )  # fmt: skip
-    if lost := clip.info["frames_lost"]:
-        progress.note(f"decode: the clip is damaged or cut off: {lost} frames are lost, {len(clip.t)} are used")
-    if clip.info["every"] > 1:
-        progress.note(f"decode: the clip is long: it is taken at {clip.info['fps']:.3g} frames a second")
-    if (side := clip.info["max_side"]) < config.max_side:
-        progress.note(f"decode: the clip is very long: its frames are {side} px, not {config.max_side}")
-    if dropped := clip.info["frames_dropped"]:
-        left_out = f"its last {dropped / clip.info['fps']:.0f} s are left out (see start, duration)"
-        progress.note(f"decode: the clip is too long: {left_out}")
-    clip.info["contrast"] = gain = stretch(clip.frames)
-    if gain > 1:
-        progress.note(f"decode: the clip is dark or hazy: its contrast is taken {gain:g} times")
-    return Artifact(npz={"frames.npz": {"frames": clip.frames, "t": clip.t}}, json={"video.json": clip.info})
 
 
 def run_masks(inputs: Inputs, config: MasksConfig, progress: Progress) -> Artifact:

@@ -41,16 +41,18 @@ def decode(
     duration: float = 0.0,
     fps: float = 30.0,
     max_side: int = 640,
+    enlarge: float = 1.0,
     megapixels: float = 280.0,
     progress=lambda fraction: None,
 ) -> Clip:
-    """Decode `path`, resampling to at most `fps` and shrinking to `max_side` px.
+    """Decode `path`, resampling to at most `fps` and scaling the longer side to `max_side` px.
 
     Args:
         start: s from the clip's first frame.
         duration: s; 0 means up to the end.
         fps: upper bound of the frame rate. A slower source keeps its own; of a faster one every n-th frame is taken if
             its rate is constant, else the frames nearest to a grid at `fps`.
+        enlarge: a smaller clip is enlarged, by that much at most, unless it would be too long then.
         megapixels: million pixels of all frames together, the bound on memory; see `fit_in`.
 
     Raises:
@@ -83,7 +85,7 @@ def decode(
         start = round(start * source_fps) / source_fps
 
     size = (info["source_width"] * info["pixel_aspect"], info["source_height"])
-    every, side, kept = fit_in(wanted, rate, size, max_side, megapixels)
+    every, side, kept = fit_in(wanted, rate, size, max_side, enlarge, megapixels)
     rate /= every
     grid = start + np.arange(kept) / rate
     with closing(_frames(path, float(pts[0]), start)) as frames:
@@ -103,7 +105,7 @@ def decode(
         "frames_lost": lost + kept - count,
         "frames_dropped": (wanted + every - 1) // every - kept,
         "every": every,
-        "max_side": side,
+        "max_side": round(side),
         "start_s": start + late / rate,
     }
     if info["focal_35mm"]:
@@ -112,27 +114,31 @@ def decode(
 
 
 def fit_in(
-    frames: int, rate: float, size: tuple[float, float], max_side: int, megapixels: float
-) -> tuple[int, int, int]:
-    """What is taken of a long clip: every n-th frame first, though no fewer than `LEAST_FPS` a second; then smaller
-    frames, though no smaller than `LEAST_SIDE`; what is still too much is left out at the end.
+    frames: int, rate: float, size: tuple[float, float], max_side: int, enlarge: float, megapixels: float
+) -> tuple[int, float, int]:
+    """What is taken of a clip. A small one is enlarged if that fits in. Of a long one every n-th frame is taken first,
+    though no fewer than `LEAST_FPS` a second; then smaller frames, though no smaller than `LEAST_SIDE`; what is still
+    too much is left out at the end.
 
     Args:
         frames: wanted, `rate` of them a second.  size: px, of the source, width and height.
 
     Returns:
-        n, the longer side in px at most, and the number of frames.
+        n, the longer side in px, and the number of frames.
     """
     budget, longer = 1e6 * megapixels, max(size)
     flat = min(size) / longer
-    area = lambda side: flat * min(side, longer) ** 2  # noqa: E731
+    large = min(max_side, enlarge * longer)
+    if frames * flat * large**2 <= budget:
+        return 1, large, frames
+    own = min(max_side, longer)
     most = max(1, int(rate / LEAST_FPS))
-    every = next((n for n in range(1, most) if -(-frames // n) * area(max_side) <= budget), most)
+    every = next((n for n in range(1, most) if -(-frames // n) * flat * own**2 <= budget), most)
     taken = -(-frames // every)
-    if taken * area(max_side) <= budget:
-        return every, max_side, taken
-    side = min(max_side, max(LEAST_SIDE, int(np.sqrt(budget / (taken * flat)))))
-    return every, side, min(taken, max(MIN_FRAMES, int(budget / area(side))))
+    if taken * flat * own**2 <= budget:
+        return every, own, taken
+    side = min(own, max(LEAST_SIDE, int(np.sqrt(budget / (taken * flat)))))
+    return every, side, min(taken, max(MIN_FRAMES, int(budget / (flat * side**2))))
 
 
 def _require_enough(count: int, path: Path, why: str) -> None:
@@ -255,7 +261,7 @@ def _stream_info(container) -> dict:
     }
 
 
-def _fill(grid, frames, step: float, aspect: float, max_side: int, progress) -> tuple[np.ndarray, int, int]:
+def _fill(grid, frames, step: float, aspect: float, side: float, progress) -> tuple[np.ndarray, int, int]:
     """The source frame nearest to each grid time, as far as there are any; how many grid times before the first frame
     are left out; and the rotation applied (degrees)."""
     stack, count, rotation, late = np.zeros((0, 0, 0, 3), np.uint8), 0, 0, 0
@@ -265,7 +271,7 @@ def _fill(grid, frames, step: float, aspect: float, max_side: int, progress) -> 
         nonlocal stack, count, rotation
         rgb = None
         while previous and count < len(grid) and grid[count] <= limit:
-            rgb = _to_rgb(previous[1], aspect, max_side) if rgb is None else rgb
+            rgb = _to_rgb(previous[1], aspect, side) if rgb is None else rgb
             if not count:
                 stack, rotation = np.empty((len(grid), *rgb.shape), np.uint8), int(previous[1].rotation) % 360
             stack[count] = rgb
@@ -286,11 +292,12 @@ def _fill(grid, frames, step: float, aspect: float, max_side: int, progress) -> 
     return stack[:count], late, rotation
 
 
-def _to_rgb(frame: av.VideoFrame, aspect: float, max_side: int) -> np.ndarray:
-    """(H, W, 3) uint8, square pixels, long side at most `max_side`, upright."""
+def _to_rgb(frame: av.VideoFrame, aspect: float, side: float) -> np.ndarray:
+    """(H, W, 3) uint8, square pixels, the longer side of `side` px, upright."""
     width, height = frame.width * aspect, float(frame.height)
-    scale = min(1.0, max_side / max(width, height))
+    scale = side / max(width, height)
     # Even sizes keep video encoders of the later stages content.
-    width, height = (max(2, 2 * round(side * scale / 2)) for side in (width, height))
-    rgb = frame.reformat(width=width, height=height, format="rgb24", interpolation="AREA").to_ndarray()
+    width, height = (max(2, 2 * round(scale * n / 2)) for n in (width, height))
+    how = "BICUBIC" if scale > 1 else "AREA"
+    rgb = frame.reformat(width=width, height=height, format="rgb24", interpolation=how).to_ndarray()
     return np.ascontiguousarray(np.rot90(rgb, round(frame.rotation / 90) % 4))
