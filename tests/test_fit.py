@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from slomo.errors import InvalidData, UsageError
 from slomo.motion import KeypointMotion
 from slomo.pinhole import Intrinsics
-from slomo.reconstruct import fit, hypotheses, observations, silhouette
+from slomo.reconstruct import gaits, hypotheses, observations, silhouette
 from slomo.reconstruct.fit_stage import run_fit
 from slomo.reconstruct.hypotheses import GaitHypothesis
 from slomo.reconstruct.kinematics import Kinematics
@@ -113,12 +113,12 @@ def walk() -> tuple[np.ndarray, dict, dict]:
     return _walk()
 
 
-@pytest.mark.parametrize(("same", "headings"), [(fit.SAME, 1), (-1.0, 2)])
+@pytest.mark.parametrize(("same", "headings"), [(gaits.SAME, 1), (-1.0, 2)])
 def test_one_candidate_leaves_all_gaits_out(walk, monkeypatch, same, headings):
     """And no more: two headings that are as good are both fitted, however few hypotheses are asked for, unless they
     are one: here the way of travel is one of the fixed ways."""
     _, masks, flow = walk
-    monkeypatch.setattr(fit, "SAME", same)
+    monkeypatch.setattr(gaits, "SAME", same)
     out = run_fit(_inputs(masks, flow), replace(TINY, candidates=1), Silent())
     tried = out.json["report.json"]["search"]["gait"]
     assert len(tried) == headings

@@ -8,7 +8,7 @@ import torch
 
 from slomo.pinhole import Intrinsics
 from slomo.prior.labels import BINS
-from slomo.reconstruct import fit, hypotheses, pose_track, posture, silhouette
+from slomo.reconstruct import fit, gaits, hypotheses, pose_track, posture, silhouette
 from slomo.reconstruct.evidence import gather
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.observations import observe
@@ -157,7 +157,7 @@ def test_headings_are_told_apart_by_how_far_they_are_turned(raising):
     yaw = np.radians([170.0, -175.0, 90.0])[:, None] * np.ones(T)
     x = problem.variables(3, torch.Generator().manual_seed(0))
     run = Run(0, x, hypotheses.placed(problem.kin, root, yaw), [{}, {}, {}])
-    assert np.degrees(fit._turned(problem, run, 0).numpy()) == pytest.approx([0, 15, 80], abs=0.1)
+    assert np.degrees(gaits.turned(problem, run, 0).numpy()) == pytest.approx([0, 15, 80], abs=0.1)
 
 
 @pytest.mark.parametrize(("far", "strides"), [(0.2, False), (1.5, True)])

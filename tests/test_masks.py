@@ -16,7 +16,7 @@ from slomo.reconstruct.motion_segment import border_distance
 from slomo.reconstruct.passing import give_back_what_passes
 from slomo.reconstruct.segment import component_at, frame_certainty, frame_quality, spans
 from slomo.reconstruct.stage import MasksConfig, pack, run_masks, unpack
-from slomo.reconstruct.surroundings import _staying, give_back_patches
+from slomo.reconstruct.surroundings import _staying, give_back_patches, give_back_surroundings
 from slomo.reconstruct.votes import vote_over_time
 from slomo.stage import Artifact, Inputs, Silent
 
@@ -150,6 +150,24 @@ def test_a_piece_that_moves_along_with_the_body_is_not_given_back():
         left = _staying(gone, k, bodies, flow, motion)  # pyright: ignore[reportArgumentType]
         assert left[parts["floor"]].mean() == (0 if stays else 1)
         assert left[gone & ~parts["floor"]].all()
+
+
+@pytest.mark.parametrize(("along", "stays"), [(1.0, True), (0.0, False)])
+def test_a_flank_of_the_grounds_colour_stays_where_it_moves_along(along: float, stays: bool):
+    """Masks that show a dark front are the smallest, so colours are learned from them; where the body turns its flank,
+    which has the colour of the ground, motion says whether that is its own."""
+    frames, parts = furniture()
+    y, x = np.mgrid[:120, :200]
+    flank = (np.abs(x - 95) < 28) & (y > 78) & (y < 100) & ~parts["body"]
+    frames[:10][:, flank] = 225  # in other frames it is elsewhere
+    layers = {k: (parts["body"] | (flank if k >= 10 else False)).astype(np.float16) for k in range(len(frames))}
+    moves = np.where(flank, along, 1.0) * (parts["body"] | flank)
+    flow = SimpleNamespace(chain=lambda source, target: np.zeros((*flank.shape, 2), np.float32))
+    motion = SimpleNamespace(velocity=lambda k, body: np.ones(2), share=lambda k, velocity: moves)
+    count = give_back_surroundings(frames, layers, flow, motion)  # pyright: ignore[reportArgumentType]
+    assert (count == 0) == stays
+    assert (layers[20] > 0.5)[flank].mean() == pytest.approx(float(stays), abs=0.1)
+    assert (layers[20] > 0.5)[parts["body"]].mean() > 0.95
 
 
 def test_pieces_of_furniture_are_given_back_and_a_head_of_their_colour_is_not():

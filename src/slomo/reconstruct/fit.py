@@ -5,31 +5,28 @@ Every phase is one `optimise` of a batch of hypotheses; between phases they are 
 best go on. All of it is deterministic by the seed, and a checkpoint within any phase resumes to the same bits.
 """
 
-import math
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 
-from slomo.reconstruct import alike, gaits, hypotheses, limb_track, pose_track, sides, starts
-from slomo.reconstruct.hypotheses import GaitHypothesis, RootGuess
+from slomo.reconstruct import alike, gaits, hypotheses, limb_track, sides, starts
+from slomo.reconstruct.hypotheses import RootGuess
+from slomo.reconstruct.overtaking import overtaking
 from slomo.reconstruct.problem import Problem, Schedule, optimise, pick, rank
 from slomo.reconstruct.run import Run, checkpoint, join, restore
-from slomo.reconstruct.stride import Steps, steps_of
-from slomo.reconstruct.trajectory import Guess
 from slomo.stage import Progress
 
 Tensor = torch.Tensor
 
 TIE = 0.03  # a rival whose loss is higher by this share may still win in the end
 TURNED = 0.1  # the same of one that faces the other way: short fits say little of that
-SAME = math.radians(10.0)  # headings that differ by less are one
 STEPS = 0.04  # share by which the loss without a gait must be lower over more than a body length
-STAYS = 0.3  # body lengths: a person who never gets further from where they began takes no strides
-ALIKE = 0.01  # share by which the loss with strides that are alike may be higher
+ALIKE = 0.01  # share by which the loss may be higher with strides that are alike, or legs that overtake each other
 ELSEWHERE = 0.1  # body lengths between the feet of two hypotheses that move their legs otherwise, on average
 _MOTION = ("gait", "legs", "seen")
 PHASES = ("heading", "gait", "rivals", "final", "limbs")
+LIMBS = PHASES.index("limbs")
+OVERTAKING = "overtaking"  # a phase after those, of few clips
 FINAL = PHASES.index("final")  # from there on little is between two hypotheses, and many draws tell them apart
 
 
@@ -58,27 +55,29 @@ def fit(
         run = starts.start(problem, root, generator)
     total = total_cost(effort)
     while True:
-        schedule = effort.schedules[run.phase]
+        schedule = effort.schedules[FINAL if run.phase > LIMBS else run.phase]
         done = sum(s.iterations * _cost(s) for s in effort.schedules[: run.phase])
 
         def each(i: int, optimiser: torch.optim.Adam, loss: Tensor, run=run, schedule=schedule, done=done) -> None:
-            fraction = (done + i * _cost(schedule)) / total
-            progress.update(fraction, f"{PHASES[run.phase]} {i}/{schedule.iterations}, loss {float(loss.min()):.3f}")
+            fraction = min(1.0, (done + i * _cost(schedule)) / total)
+            progress.update(fraction, f"{_name(run.phase)} {i}/{schedule.iterations}, loss {float(loss.min()):.3f}")
             if progress.checkpoint_due():
                 progress.save(checkpoint(run, i, optimiser, generator))
 
-        at = problem if run.phase == len(PHASES) - 1 else sides.unsettled(problem)
+        at = problem if run.phase >= LIMBS else sides.unsettled(problem)
         run.x = optimise(at, run.x, run.guess, schedule, generator, start=start, adam_state=adam_state, each=each)
         start, adam_state = 0, None
         judge = at if run.phase < FINAL or _front_or_back(run) else sides.doubting(at)
         losses = rank(judge, run.x, run.guess, draws=4 if run.phase < FINAL else 24)
-        run.log[PHASES[run.phase]] = [
+        run.log[_name(run.phase)] = [
             label | {"loss": round(float(v), 4)} for label, v in zip(run.labels, losses, strict=True)
         ]
-        if run.phase == len(PHASES) - 1:
-            return _winner(run, _alike(run, losses))
-        step = (_to_gait, _to_rivals, _to_final, _to_limbs)[run.phase]
+        if run.phase > LIMBS:
+            return _winner(run, _open(run, losses))
+        step = (_to_gait, _to_rivals, _to_final, _to_limbs, _to_overtaking)[run.phase]
         run = step(problem, run, losses, root, effort, metres, progress)
+        if run.phase > LIMBS and len(run.labels) == 1:
+            return run
 
 
 def polish(problem: Problem, run: Run, schedule: Schedule, *, seed: int, progress: Progress) -> Run:
@@ -100,6 +99,10 @@ def polish(problem: Problem, run: Run, schedule: Schedule, *, seed: int, progres
     return run
 
 
+def _name(phase: int) -> str:
+    return PHASES[phase] if phase <= LIMBS else OVERTAKING
+
+
 def _cost(schedule: Schedule) -> float:
     return schedule.frames * schedule.pixels + 2000
 
@@ -117,73 +120,13 @@ def _to_gait(
     metres: float | None,
     progress: Progress,
 ) -> Run:
-    """Lay postures and gaits over the best heading (and another one when it is close), rank them as they are, keep the
-    best few."""
-    order = losses.argsort().tolist()
-    away = _turned(problem, run, order[0]).tolist()
-    close = [k for k in order[1:] if losses[k] < 1.15 * losses[order[0]] and away[k] > SAME]
-    keep = order[:1] + close[:1]
-    skeleton, kin = problem.kin.skeleton, problem.kin
-    speed = float(np.median(root.speed))
-    steps = _steps(problem, root)
-    grid = hypotheses.gait_grid(steps, skeleton, leg=kin.leg, speed=speed, metres=metres, phases=effort.phases_of_gait)
-    if skeleton.kind == "human" and root.travelled < STAYS:
-        grid = []  # squats and jumping jacks are no strides
-    run.log["stride_candidates_hz"] = sorted({round(g.frequency, 3) for g in grid})
-    run.log["stride_clock_power"] = steps.power
-    known = {g.name: g for g in skeleton.gaits}
-    done = effort.schedules[0].iterations * _cost(effort.schedules[0]) / total_cost(effort)
-
-    def pose(g: GaitHypothesis) -> tuple[np.ndarray, np.ndarray]:
-        t = problem.obs.t.numpy()
-        return hypotheses.gait_pose(kin, known[g.name], g, t, clock=steps.clock, speed=root.speed, leg=kin.leg)
-
-    def trying(number: int) -> None:
-        progress.update(done, f"trying {len(grid)} gaits: {number}")
-
-    entries: list[gaits.Laid] = []
-    postures, posture_names = hypotheses.posture_angles(kin)
-    posed: list[Guess] = []
-    for k in keep:
-        one = torch.tensor([k])
-        base = run.guess.pick(one)
-        # In place of the posture it began with.
-        if skeleton.kind == "human":
-            track = pose_track.tracks(problem, pick(run.x, one), base, root, postures)[0]
-            base = replace(base, q=torch.as_tensor(track.q, dtype=torch.float32)[None])
-            best = int(track.postures.argmax())
-        else:
-            wide = base.pick(torch.zeros(len(postures), dtype=torch.long))
-            guess = replace(wide, q=postures[:, None].expand(-1, wide.q.shape[1], -1, -1).contiguous())
-            value = rank(problem, pick(run.x, one.expand(len(postures))), guess, draws=2, frames=12, pixels=200)
-            base, best = guess.pick(value.argmin()[None]), int(value.argmin())
-        run.labels[k] = run.labels[k] | {"posture": posture_names[best]}
-        posed.append(base)
-        entries += gaits.lay(problem, pick(run.x, one), k, base, grid, pose, trying)
-    entries = gaits.ranked(problem, run.x, entries)
-    chosen = gaits.diverse(entries, max(0, effort.candidates - len(keep)))
-    which = torch.tensor(keep + [e.heading for e in chosen])
-    guesses = posed + [e.guess for e in chosen]
-    labels = [run.labels[k] | {"gait": "none"} for k in keep]
-    labels += [
-        run.labels[e.heading]
-        | {"gait": e.gait.name, "stride_hz": round(e.gait.frequency, 3), "phase": round(e.gait.phase, 3)}
-        for e in chosen
-    ]
-    return Run(1, pick(run.x, which), join(guesses), labels, run.log)
-
-
-def _turned(problem: Problem, run: Run, one: int) -> Tensor:
-    """(H,) rad, by how much the heading of each hypothesis differs from that of `one`, the median over the clip."""
-    with torch.no_grad():
-        _, R, _ = problem.path(run.x, run.guess, run.x["shape.log_length"].exp(), problem.obs.at)
-    ahead = torch.nn.functional.normalize(R[..., :2, 0], dim=-1)
-    return torch.acos((ahead * ahead[one]).sum(-1).clamp(-1, 1)).median(1).values
-
-
-def _steps(problem: Problem, root: RootGuess) -> Steps:
-    # The speed of one who stays in place is noise.
-    return steps_of(problem.obs, root.speed if root.travelled > 1 else np.ones_like(root.speed))
+    """The best few of the gaits over the best headings."""
+    first = effort.schedules[0]
+    done = first.iterations * _cost(first) / total_cost(effort)
+    return gaits.tried(
+        problem, run, losses, root, candidates=effort.candidates, phases=effort.phases_of_gait, metres=metres,
+        trying=lambda what: progress.update(done, what),
+    )  # fmt: skip
 
 
 def _to_rivals(problem: Problem, run: Run, losses: Tensor, root: RootGuess, *_) -> Run:
@@ -233,9 +176,10 @@ def _stepping(run: Run, losses: Tensor, root: RootGuess) -> Tensor:
     return losses * torch.tensor([1 + STEPS * (label["gait"] == "none") for label in run.labels])
 
 
-def _alike(run: Run, losses: Tensor) -> Tensor:
-    """(H,) losses to compare by. Where the picture leaves it open strides are alike: their loss may be higher."""
-    return losses * torch.tensor([1 - ALIKE * ("strides" in label) for label in run.labels])
+def _open(run: Run, losses: Tensor) -> Tensor:
+    """(H,) losses to compare by. Where the picture leaves it open strides are alike, and legs overtake each other."""
+    likely = OVERTAKING if run.phase > LIMBS else "strides"
+    return losses * torch.tensor([1 - ALIKE * (likely in label) for label in run.labels])
 
 
 def _either_way(problem: Problem, root: RootGuess) -> bool:
@@ -270,7 +214,7 @@ def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effor
                 rivals.append(found)
                 labels.append(labels[0] | {"limbs": "on their own"})
         if labels[0]["gait"] != "none" or root.travelled > 1:
-            clock = _steps(problem, root).clock
+            clock = gaits.steps(problem, root).clock
             hz = [labels[0]["stride_hz"]] if "stride_hz" in labels[0] else run.log["stride_candidates_hz"]
             found = alike.borrowed(problem, *rivals[-1], clock=clock, frequencies=hz)
             if found is not None:
@@ -287,10 +231,21 @@ def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effor
     return Run(run.phase + 1, x, join([guess for _, guess in rivals]), labels, run.log)
 
 
+def _to_overtaking(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, *_) -> Run:
+    """The best one goes on and, of who travels, beside it with legs that overtake each other."""
+    best = _winner(run, _open(run, losses))
+    rivals = [("", best.x, best.guess)]
+    if root.travelled > 1 and effort.schedules[LIMBS].iterations:
+        rivals += overtaking(problem, best.x, best.guess)
+    x = {k: torch.cat([x[k] for _, x, _ in rivals]) for k in best.x}
+    labels = [best.labels[0] | ({OVERTAKING: name} if name else {}) for name, *_ in rivals]
+    return Run(run.phase + 1, x, join([guess for _, _, guess in rivals]), labels, run.log)
+
+
 def _winner(run: Run, losses: Tensor) -> Run:
     """The hypothesis of least loss; the log of the phase has them in the order of their losses."""
     order = losses.argsort()
-    phase = PHASES[run.phase]
+    phase = _name(run.phase)
     run.log[phase] = [run.log[phase][int(k)] for k in order]
     best = order[:1]
     return Run(run.phase, pick(run.x, best), run.guess.pick(best), [run.labels[int(best)]], run.log)

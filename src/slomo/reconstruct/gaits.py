@@ -7,13 +7,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from slomo.reconstruct.hypotheses import GaitHypothesis
+from slomo.reconstruct import hypotheses, pose_track
+from slomo.reconstruct.hypotheses import GaitHypothesis, RootGuess
 from slomo.reconstruct.problem import Problem, Variables, pick, rank
-from slomo.reconstruct.run import join
+from slomo.reconstruct.run import Run, join
+from slomo.reconstruct.stride import Steps, steps_of
 from slomo.reconstruct.trajectory import Guess
 
 Array = np.ndarray
 
+SAME = math.radians(10.0)  # headings that differ by less are one
+STAYS = 0.3  # body lengths: a person who never gets further from where they began takes no strides
 AT_ONCE = 24  # gaits
 SHORTLIST = 48  # of them that are ranked once more
 NEXT = 1.5 / 12  # turns between a phase and those next to it, at most
@@ -27,6 +31,92 @@ class Laid:
     heading: int
     gait: GaitHypothesis
     guess: Guess
+
+
+def tried(
+    problem: Problem,
+    run: Run,
+    losses: torch.Tensor,
+    root: RootGuess,
+    *,
+    candidates: int,
+    phases: int,
+    metres: float | None,
+    trying: Callable[[str], None],
+) -> Run:
+    """Lay postures and gaits over the best heading (and another one when it is close), rank them as they are, keep the
+    best few.
+
+    Args:
+        losses: (H,) of the headings.  candidates: hypotheses that are kept.  phases: tried of each gait.
+        metres: body length m, for Froude numbers; None: not known.
+        trying: told what is being done.
+    """
+    order = losses.argsort().tolist()
+    away = turned(problem, run, order[0]).tolist()
+    close = [k for k in order[1:] if losses[k] < 1.15 * losses[order[0]] and away[k] > SAME]
+    keep = order[:1] + close[:1]
+    skeleton, kin = problem.kin.skeleton, problem.kin
+    speed = float(np.median(root.speed))
+    found = steps(problem, root)
+    grid = hypotheses.gait_grid(found, skeleton, leg=kin.leg, speed=speed, metres=metres, phases=phases)
+    if skeleton.kind == "human" and root.travelled < STAYS:
+        grid = []  # squats and jumping jacks are no strides
+    run.log["stride_candidates_hz"] = sorted({round(g.frequency, 3) for g in grid})
+    run.log["stride_clock_power"] = found.power
+    known = {g.name: g for g in skeleton.gaits}
+
+    def pose(g: GaitHypothesis) -> tuple[Array, Array]:
+        t = problem.obs.t.numpy()
+        return hypotheses.gait_pose(kin, known[g.name], g, t, clock=found.clock, speed=root.speed, leg=kin.leg)
+
+    def tell(number: int) -> None:
+        trying(f"trying {len(grid)} gaits: {number}")
+
+    entries: list[Laid] = []
+    postures, posture_names = hypotheses.posture_angles(kin)
+    posed: list[Guess] = []
+    for k in keep:
+        one = torch.tensor([k])
+        base = run.guess.pick(one)
+        # In place of the posture it began with.
+        if skeleton.kind == "human":
+            track = pose_track.tracks(problem, pick(run.x, one), base, root, postures)[0]
+            base = replace(base, q=torch.as_tensor(track.q, dtype=torch.float32)[None])
+            best = int(track.postures.argmax())
+        else:
+            wide = base.pick(torch.zeros(len(postures), dtype=torch.long))
+            guess = replace(wide, q=postures[:, None].expand(-1, wide.q.shape[1], -1, -1).contiguous())
+            value = rank(problem, pick(run.x, one.expand(len(postures))), guess, draws=2, frames=12, pixels=200)
+            base, best = guess.pick(value.argmin()[None]), int(value.argmin())
+        run.labels[k] = run.labels[k] | {"posture": posture_names[best]}
+        posed.append(base)
+        entries += lay(problem, pick(run.x, one), k, base, grid, pose, tell)
+    entries = ranked(problem, run.x, entries)
+    chosen = diverse(entries, max(0, candidates - len(keep)))
+    which = torch.tensor(keep + [e.heading for e in chosen])
+    guesses = posed + [e.guess for e in chosen]
+    labels = [run.labels[k] | {"gait": "none"} for k in keep]
+    labels += [
+        run.labels[e.heading]
+        | {"gait": e.gait.name, "stride_hz": round(e.gait.frequency, 3), "phase": round(e.gait.phase, 3)}
+        for e in chosen
+    ]
+    return Run(1, pick(run.x, which), join(guesses), labels, run.log)
+
+
+def turned(problem: Problem, run: Run, one: int) -> torch.Tensor:
+    """(H,) rad, by how much the heading of each hypothesis differs from that of `one`, the median over the clip."""
+    with torch.no_grad():
+        _, R, _ = problem.path(run.x, run.guess, run.x["shape.log_length"].exp(), problem.obs.at)
+    ahead = torch.nn.functional.normalize(R[..., :2, 0], dim=-1)
+    return torch.acos((ahead * ahead[one]).sum(-1).clamp(-1, 1)).median(1).values
+
+
+def steps(problem: Problem, root: RootGuess) -> Steps:
+    """The clip's rhythm."""
+    # The speed of one who stays in place is noise.
+    return steps_of(problem.obs, root.speed if root.travelled > 1 else np.ones_like(root.speed))
 
 
 def lay(

@@ -54,7 +54,7 @@ class SaliencySegmenter:
         for order in (keys[keys.index(seed) :], keys[: keys.index(seed) + 1][::-1]):
             track.follow(order, lambda: progress(0.2 + 0.5 * len(track.layers) / len(keys)))
         layers, told = track.layers, track.settle_who_is_who()
-        given_back = {"colour_repaired_frames": give_back_surroundings(frames, layers)}
+        given_back = {"colour_repaired_frames": give_back_surroundings(frames, layers, flow, motion)}
         given_back |= {"passed_frames": give_back_what_passes(layers, motion)}
         given_back |= {"patched_frames": give_back_patches(frames, layers, flow, motion)}
         progress(0.8)

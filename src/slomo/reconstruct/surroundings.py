@@ -23,12 +23,13 @@ _ALONG = 0.5  # of the body's motion, from which on a patch moves along with it
 _NEARLY = 0.2  # of the patch may not: flow carries the rim of a plain wall along with what is before it
 
 
-def give_back_surroundings(frames: np.ndarray, layers: dict[int, np.ndarray]) -> int:
+def give_back_surroundings(frames: np.ndarray, layers: dict[int, np.ndarray], flow: Flow, motion: SharedMotion) -> int:
     """Take out of `layers`, in place, what the network added of furniture and the like. Returns the frames concerned.
 
     Colours are learned from the quarter of the masks that are smallest (though no slivers), against their
-    surroundings. A mask a good part of which is patches of the colours of those surroundings is cut anew with them;
-    what then is left without most of the usual area says nothing and is dropped, for the frames next to it to fill.
+    surroundings. A mask a good part of which is patches of the colours of those surroundings, and does not move along
+    with the body (its flank, where those masks show it from the front), is cut anew with them; what then is left
+    without most of the usual area says nothing and is dropped, for the frames next to it to fill.
     """
     bodies = {k: p > 0.5 for k, p in layers.items()}
     area = {k: int(b.sum()) for k, b in bodies.items() if b.any()}
@@ -39,19 +40,24 @@ def give_back_surroundings(frames: np.ndarray, layers: dict[int, np.ndarray]) ->
         return 0
     model = learn_colours(frames, {k: bodies[k] for k in trusted}, reach=2.0)
     colour = lambda k: cv2.GaussianBlur(model(to_lab(frames[k])), (0, 0), 1.5)  # noqa: E731
-    swallowing = [k for k in area if _foreign(bodies[k], colour(k)) > _FOREIGN]
-    for k in swallowing:
+    along: dict[int, np.ndarray] = {}
+    for k in area:
+        if (patches := _foreign(bodies[k], colour(k))).sum() > _FOREIGN * area[k]:
+            own = _along(k, bodies, flow, motion)
+            if (patches & ~own).sum() > _FOREIGN * area[k]:
+                along[k] = own
+    for k, own in along.items():
         # The network has shown here that it does not know, so colour outweighs it.
         logit = 2.0 * (np.clip(colour(k), -2.0, 2.0) - 0.5) + layers[k] - 0.5
         probability = np.where(grown(bodies[k], 0.1), 1.0 / (1.0 + np.exp(-logit)), 0.0)
-        layers[k] = cut(frames[k], probability).astype(np.float16)
-    if swallowing:
+        layers[k] = (cut(frames[k], probability) | (own & bodies[k])).astype(np.float16)
+    if along:
         left = {k: float((p > 0.5).sum()) for k, p in layers.items()}
         trusted_area = np.median([area[k] for k in trusted])
-        for k in swallowing:
+        for k in along:
             if left[k] < 0.5 * trusted_area and len(layers) > len(left) // 3:
                 del layers[k]
-    return len(swallowing)
+    return len(along)
 
 
 def give_back_patches(frames: np.ndarray, layers: dict[int, np.ndarray], flow: Flow, motion: SharedMotion) -> int:
@@ -105,7 +111,7 @@ def _patches(
         if stats[i, cv2.CC_STAT_AREA] < _LEAST * area or colour[piece].mean() > _COLOUR:
             continue
         beside = cv2.dilate(piece.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-        end, seam = _along(edge, body, piece), _along(edge, body & ~piece, beside)
+        end, seam = _outlined(edge, body, piece), _outlined(edge, body & ~piece, beside)
         if end < _FAINT * seam or _lasting(piece, k, bodies, flow) < _RARELY:
             gone |= piece
     return gone
@@ -114,16 +120,22 @@ def _patches(
 def _staying(gone: np.ndarray, k: int, bodies: dict[int, np.ndarray], flow: Flow, motion: SharedMotion) -> np.ndarray:
     """(H, W) bool: what of `gone` in frame k does not share the body's motion there, or, where the body is at rest
     then, in the nearest of the frames around in which it is not."""
-    left = gone.copy()
+    left, along = gone.copy(), _along(k, bodies, flow, motion)
+    for piece in components(gone, 1):
+        if along[piece].mean() > 1 - _NEARLY:
+            left &= ~piece
+    return left
+
+
+def _along(k: int, bodies: dict[int, np.ndarray], flow: Flow, motion: SharedMotion) -> np.ndarray:
+    """(H, W) bool: what moves along with the body in frame k or, where the body is at rest then, in the nearest of the
+    frames around in which it is not; nothing where it rests in all of them."""
     for other in (k, *frames_around(k, bodies)):
         share = motion.share(other, motion.velocity(other, bodies[other]))
         if share is not None:
             there = sample(share, flow.chain(k, other)) if other != k else share
-            for piece in components(gone, 1):
-                if np.quantile(np.nan_to_num(there[piece]), _NEARLY) > _ALONG:
-                    left &= ~piece
-            break
-    return left
+            return np.nan_to_num(there) > _ALONG
+    return np.zeros_like(bodies[k])
 
 
 def _edges(lab: np.ndarray) -> np.ndarray:
@@ -133,7 +145,7 @@ def _edges(lab: np.ndarray) -> np.ndarray:
     return cv2.dilate(np.sqrt(change), np.ones((3, 3), np.uint8))
 
 
-def _along(edge: np.ndarray, body: np.ndarray, where: np.ndarray) -> float:
+def _outlined(edge: np.ndarray, body: np.ndarray, where: np.ndarray) -> float:
     """Mean edge along the outline of a body where that is; infinite where there is none."""
     outline = body & (cv2.erode(body.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0) & where
     return float(edge[outline].mean()) if outline.any() else np.inf
@@ -156,9 +168,8 @@ def _lasting(piece: np.ndarray, k: int, bodies: dict[int, np.ndarray], flow: Flo
     return float(np.mean(parts)) if parts else 1.0
 
 
-def _foreign(body: np.ndarray, colour: np.ndarray) -> float:
-    """Part of a mask that is whole patches of the surroundings' colours; the speckles of a coat do not count."""
+def _foreign(body: np.ndarray, colour: np.ndarray) -> np.ndarray:
+    """(H, W) bool, what of a mask is whole patches of the surroundings' colours; speckles of a coat do not count."""
     radius = max(1, round(0.06 * np.sqrt(body.sum())))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    patches = cv2.morphologyEx((body & (colour < -0.5)).astype(np.uint8), cv2.MORPH_OPEN, disc)
-    return float(patches.sum() / body.sum())
+    return cv2.morphologyEx((body & (colour < -0.5)).astype(np.uint8), cv2.MORPH_OPEN, disc) > 0
