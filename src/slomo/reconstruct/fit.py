@@ -21,7 +21,7 @@ Tensor = torch.Tensor
 TIE = 0.03  # a rival whose loss is higher by this share may still win in the end
 TURNED = 0.1  # the same of one that faces the other way: short fits say little of that
 STEPS = 0.04  # share by which the loss without a gait must be lower over more than a body length
-ALIKE = 0.01  # share by which the loss may be higher with strides that are alike, or legs that overtake each other
+ALIKE = 0.01  # share by which the loss with strides that are alike may be higher
 ELSEWHERE = 0.1  # body lengths between the feet of two hypotheses that move their legs otherwise, on average
 _MOTION = ("gait", "legs", "seen")
 PHASES = ("heading", "gait", "rivals", "final", "limbs")
@@ -73,7 +73,7 @@ def fit(
             label | {"loss": round(float(v), 4)} for label, v in zip(run.labels, losses, strict=True)
         ]
         if run.phase > LIMBS:
-            return _winner(run, _open(run, losses))
+            return _winner(run, _alike(run, losses))
         step = (_to_gait, _to_rivals, _to_final, _to_limbs, _to_overtaking)[run.phase]
         run = step(problem, run, losses, root, effort, metres, progress)
         if run.phase > LIMBS and len(run.labels) == 1:
@@ -176,10 +176,9 @@ def _stepping(run: Run, losses: Tensor, root: RootGuess) -> Tensor:
     return losses * torch.tensor([1 + STEPS * (label["gait"] == "none") for label in run.labels])
 
 
-def _open(run: Run, losses: Tensor) -> Tensor:
-    """(H,) losses to compare by. Where the picture leaves it open strides are alike, and legs overtake each other."""
-    likely = OVERTAKING if run.phase > LIMBS else "strides"
-    return losses * torch.tensor([1 - ALIKE * (likely in label) for label in run.labels])
+def _alike(run: Run, losses: Tensor) -> Tensor:
+    """(H,) losses to compare by. Where the picture leaves it open strides are alike."""
+    return losses * torch.tensor([1 - ALIKE * ("strides" in label) for label in run.labels])
 
 
 def _either_way(problem: Problem, root: RootGuess) -> bool:
@@ -233,7 +232,7 @@ def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effor
 
 def _to_overtaking(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, *_) -> Run:
     """The best one goes on and, of who travels, beside it with legs that overtake each other."""
-    best = _winner(run, _open(run, losses))
+    best = _winner(run, _alike(run, losses))
     rivals = [("", best.x, best.guess)]
     if root.travelled > 1 and effort.schedules[LIMBS].iterations:
         rivals += overtaking(problem, best.x, best.guess)
