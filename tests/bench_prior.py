@@ -20,6 +20,7 @@ from slomo.prior import metrics
 from slomo.prior.evaluate import Truth, judge, predict, truth_of
 from slomo.prior.inference import Prior, packaged, peaks
 from slomo.prior.labels import Labels, labels, view_of
+from slomo.reconstruct.decode_stage import DecodeConfig
 from slomo.reconstruct.video import decode
 from slomo.skeleton import load_skeleton
 
@@ -142,7 +143,9 @@ def main() -> None:
             print(f"{folder.name:<16}no network for {kind}")
             continue
         known, prior = labels(load_skeleton(kind)), Prior(path)
-        clip = decode(folder / "clip.mp4")  # as the stage does, so that its pixels are the bench's
+        clip = decode(
+            folder / "clip.mp4", enlarge=DecodeConfig().enlarge
+        )  # as the stage does, so that its pixels are the bench's
         frames = clip.frames
         decided, estimated = evidence(options.projects / folder.name, folder / "clip.mp4", kind, path)
         sources = {"true": folder / "masks.npz", "est": estimated / "masks.npz"}

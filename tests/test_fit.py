@@ -1,6 +1,7 @@
 """The whole fit on a walk of the skeleton itself: it must find it, resume to the same bits, and say when it cannot."""
 
 import dataclasses
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from slomo.errors import InvalidData, UsageError
 from slomo.motion import KeypointMotion
 from slomo.pinhole import Intrinsics
-from slomo.reconstruct import gaits, hypotheses, observations, silhouette
+from slomo.reconstruct import fit, gaits, hypotheses, observations, silhouette
 from slomo.reconstruct.fit_stage import run_fit
 from slomo.reconstruct.hypotheses import GaitHypothesis
 from slomo.reconstruct.kinematics import Kinematics
@@ -171,10 +172,16 @@ class Stops(Silent):
     def load(self):
         return self.saved
 
+    def saved_phase(self) -> int:
+        return json.loads(bytes(self.saved["meta"]))["phase"]  # pyright: ignore[reportOptionalSubscript]
 
-@pytest.mark.parametrize("saves", [1, 5])
-def test_an_interrupted_fit_resumes_to_the_same_bits(walk, saves: int):
+
+@pytest.mark.parametrize(("saves", "overtakes"), [(1, False), (5, False), (7, True)])
+def test_an_interrupted_fit_resumes_to_the_same_bits(walk, monkeypatch, saves: int, overtakes: bool):
+    """In the phase that few clips get to, too: what is chosen there is what the report is of."""
     _, masks, flow = walk
+    legs = lambda *motion: [("hind", *hypotheses.exchanged(*motion))] if overtakes else []  # noqa: E731
+    monkeypatch.setattr(fit, "overtaking", legs)
     whole = reconstruct(_inputs(masks, flow), TINY, Silent())
     first = Stops(saves)
     with pytest.raises(KeyboardInterrupt):
@@ -184,9 +191,13 @@ def test_an_interrupted_fit_resumes_to_the_same_bits(walk, saves: int):
         np.testing.assert_array_equal(again.npz["keypoints.npz"][k], v, err_msg=k)
     report = whole.json["report.json"]
     assert again.json["report.json"]["search"] == report["search"]
-    last = report["search"]["limbs"]
-    assert last == sorted(last, key=lambda e: e["loss"])
-    assert {k: v for k, v in last[0].items() if k != "loss"} == report["hypothesis"]
+    assert ("overtaking" in report["search"]) == overtakes
+    last, by = (report["search"]["overtaking"], "picture") if overtakes else (report["search"]["limbs"], "loss")
+    assert last == sorted(last, key=lambda e: e[by])
+    assert {k: v for k, v in last[0].items() if k not in ("loss", "picture")} == report["hypothesis"]
+    if overtakes:
+        assert [entry.get("overtaking") for entry in last].count("hind") == 1
+        assert fit.PHASES[first.saved_phase()] == "overtaking"
 
 
 def test_without_time_for_them_no_limbs_are_moved(walk):

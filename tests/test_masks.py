@@ -170,6 +170,24 @@ def test_a_flank_of_the_grounds_colour_stays_where_it_moves_along(along: float, 
     assert (layers[20] > 0.5)[parts["body"]].mean() > 0.95
 
 
+def test_floor_goes_where_a_flank_of_its_colour_stays():
+    frames, parts = furniture()
+    y, x = np.mgrid[:120, :200]
+    below, flank = (np.abs(x - 95) < 28) & (y > 90) & (y < 112), (np.abs(x - 140) < 16) & (y > 46) & (y < 78)
+    flank, below = flank & ~parts["body"], below & ~parts["body"]
+    frames[:, flank | below] = 95, 55, 35
+    frames[:10][:, flank | below] = 225
+    layers = {k: (parts["body"] | (flank | below if k >= 10 else False)).astype(np.float16) for k in range(len(frames))}
+    moves = np.where(below, 0.0, 1.0) * (parts["body"] | flank)
+    flow = SimpleNamespace(chain=lambda source, target: np.zeros((*flank.shape, 2), np.float32))
+    motion = SimpleNamespace(velocity=lambda k, body: np.ones(2), share=lambda k, velocity: moves)
+    assert give_back_surroundings(frames, layers, flow, motion) > 0  # pyright: ignore[reportArgumentType]
+    seen = layers[20] > 0.5
+    assert seen[flank].mean() > 0.8
+    assert seen[below].mean() < 0.1
+    assert seen[parts["body"]].mean() > 0.95
+
+
 def test_pieces_of_furniture_are_given_back_and_a_head_of_their_colour_is_not():
     frames, parts = furniture()
     flow = dense_flow(frames)

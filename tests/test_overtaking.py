@@ -76,5 +76,12 @@ def test_hind_legs_that_change_names_are_tried_as_legs_that_overtake_each_other(
 def test_what_the_picture_denies_is_not_tried(monkeypatch):
     problem, _, x, _, true = walking(slice(0, 0))
     half = np.arange(T) < T // 2
+    monkeypatch.setattr("slomo.reconstruct.overtaking.OPEN", 0.0)
     monkeypatch.setattr("slomo.reconstruct.overtaking.every_other", lambda *a: half)
     assert overtaking(problem, x, true) == []
+
+
+@pytest.mark.parametrize(("more", "loss"), [({}, 0.5), ({"overtaking": [{"loss": 0.4}]}, 0.4)])
+def test_the_loss_of_a_run_is_that_of_its_last_phase(more: dict, loss: float):
+    _, _, x, _, guess = walking(slice(0, 0))
+    assert Run(fit.LIMBS, x, guess, [{}], {"limbs": [{"loss": 0.5}], **more}).loss == loss

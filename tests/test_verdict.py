@@ -105,3 +105,10 @@ def _log(*limbs: dict) -> dict:
 )
 def test_swap_margin_is_of_the_longest_fits(limbs: list[dict], margin: float):
     assert _swap_margin(_log(*limbs)) == pytest.approx(margin, abs=1e-4)
+
+
+def test_swap_margin_is_of_legs_that_overtake_each_other_too():
+    log = _log({"loss": 0.4}, {"seen": "the other way", "loss": 0.42}) | {
+        "overtaking": [dict(loss=0.41, picture=0.4), dict(loss=0.4, picture=0.402)]
+    }
+    assert _swap_margin(log) == pytest.approx(0.005, abs=1e-4)

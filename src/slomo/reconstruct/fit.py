@@ -24,9 +24,8 @@ STEPS = 0.04  # share by which the loss without a gait must be lower over more t
 ALIKE = 0.01  # share by which the loss with strides that are alike may be higher
 ELSEWHERE = 0.1  # body lengths between the feet of two hypotheses that move their legs otherwise, on average
 _MOTION = ("gait", "legs", "seen")
-PHASES = ("heading", "gait", "rivals", "final", "limbs")
-LIMBS = PHASES.index("limbs")
-OVERTAKING = "overtaking"  # a phase after those, of few clips
+PHASES = ("heading", "gait", "rivals", "final", "limbs", "overtaking")
+LIMBS = PHASES.index("limbs")  # the last phase of most clips
 FINAL = PHASES.index("final")  # from there on little is between two hypotheses, and many draws tell them apart
 
 
@@ -55,12 +54,12 @@ def fit(
         run = starts.start(problem, root, generator)
     total = total_cost(effort)
     while True:
-        schedule = effort.schedules[FINAL if run.phase > LIMBS else run.phase]
+        schedule = effort.schedules[run.phase]
         done = sum(s.iterations * _cost(s) for s in effort.schedules[: run.phase])
 
         def each(i: int, optimiser: torch.optim.Adam, loss: Tensor, run=run, schedule=schedule, done=done) -> None:
-            fraction = min(1.0, (done + i * _cost(schedule)) / total)
-            progress.update(fraction, f"{_name(run.phase)} {i}/{schedule.iterations}, loss {float(loss.min()):.3f}")
+            fraction = (done + i * _cost(schedule)) / total
+            progress.update(fraction, f"{PHASES[run.phase]} {i}/{schedule.iterations}, loss {float(loss.min()):.3f}")
             if progress.checkpoint_due():
                 progress.save(checkpoint(run, i, optimiser, generator))
 
@@ -69,11 +68,11 @@ def fit(
         start, adam_state = 0, None
         judge = at if run.phase < FINAL or _front_or_back(run) else sides.doubting(at)
         losses = rank(judge, run.x, run.guess, draws=4 if run.phase < FINAL else 24)
-        run.log[_name(run.phase)] = [
+        run.log[PHASES[run.phase]] = [
             label | {"loss": round(float(v), 4)} for label, v in zip(run.labels, losses, strict=True)
         ]
         if run.phase > LIMBS:
-            return _winner(run, _alike(run, losses))
+            return _winner(run, _by_picture(at, run))
         step = (_to_gait, _to_rivals, _to_final, _to_limbs, _to_overtaking)[run.phase]
         run = step(problem, run, losses, root, effort, metres, progress)
         if run.phase > LIMBS and len(run.labels) == 1:
@@ -97,10 +96,6 @@ def polish(problem: Problem, run: Run, schedule: Schedule, *, seed: int, progres
     label = run.labels[0] | {"loss": round(float(rank(problem, run.x, run.guess)[0]), 4)}
     run.log["together"] = [label]
     return run
-
-
-def _name(phase: int) -> str:
-    return PHASES[phase] if phase <= LIMBS else OVERTAKING
 
 
 def _cost(schedule: Schedule) -> float:
@@ -181,6 +176,14 @@ def _alike(run: Run, losses: Tensor) -> Tensor:
     return losses * torch.tensor([1 - ALIKE * ("strides" in label) for label in run.labels])
 
 
+def _by_picture(problem: Problem, run: Run) -> Tensor:
+    """(H,) losses to compare by, which the log gets as well: networks are not asked whose leg it is that overtakes."""
+    losses = rank(sides.doubting(problem, 0.0), run.x, run.guess, draws=24)
+    for entry, value in zip(run.log[PHASES[run.phase]], losses, strict=True):
+        entry["picture"] = round(float(value), 4)
+    return losses
+
+
 def _either_way(problem: Problem, root: RootGuess) -> bool:
     """Whether it is a person who stays in place: no path says whether they face the camera or turn their back to it."""
     return problem.kin.skeleton.kind == "human" and root.travelled <= 1
@@ -188,10 +191,11 @@ def _either_way(problem: Problem, root: RootGuess) -> bool:
 
 def _long_enough(effort: Effort, problem: Problem, root: RootGuess) -> Effort:
     """The last phase is as long as the one before for who may be turned around: a third of it says little of that."""
-    *others, last = effort.schedules
-    if not (_either_way(problem, root) and last.iterations):
+    schedules = list(effort.schedules)
+    if not (_either_way(problem, root) and schedules[LIMBS].iterations):
         return effort
-    return replace(effort, schedules=(*others, others[FINAL]))
+    schedules[LIMBS] = schedules[FINAL]
+    return replace(effort, schedules=tuple(schedules))
 
 
 def _front_or_back(run: Run) -> bool:
@@ -206,7 +210,7 @@ def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effor
     best = _winner(run, _stepping(run, losses, root))
     rivals = [(best.x, best.guess)]
     labels = list(best.labels)
-    if effort.schedules[-1].iterations:
+    if effort.schedules[LIMBS].iterations:
         if problem.kin.skeleton.kind == "quadruped":
             found = limb_track.by_limb(problem, best.x, best.guess, leave=limb_track.LIKELY)
             if found is not None:
@@ -234,17 +238,17 @@ def _to_overtaking(problem: Problem, run: Run, losses: Tensor, root: RootGuess, 
     """The best one goes on and, of who travels, beside it with legs that overtake each other."""
     best = _winner(run, _alike(run, losses))
     rivals = [("", best.x, best.guess)]
-    if root.travelled > 1 and effort.schedules[LIMBS].iterations:
+    if root.travelled > 1 and effort.schedules[-1].iterations:
         rivals += overtaking(problem, best.x, best.guess)
     x = {k: torch.cat([x[k] for _, x, _ in rivals]) for k in best.x}
-    labels = [best.labels[0] | ({OVERTAKING: name} if name else {}) for name, *_ in rivals]
+    labels = [best.labels[0] | ({"overtaking": name} if name else {}) for name, *_ in rivals]
     return Run(run.phase + 1, x, join([guess for _, _, guess in rivals]), labels, run.log)
 
 
 def _winner(run: Run, losses: Tensor) -> Run:
     """The hypothesis of least loss; the log of the phase has them in the order of their losses."""
     order = losses.argsort()
-    phase = _name(run.phase)
+    phase = PHASES[run.phase]
     run.log[phase] = [run.log[phase][int(k)] for k in order]
     best = order[:1]
     return Run(run.phase, pick(run.x, best), run.guess.pick(best), [run.labels[int(best)]], run.log)

@@ -42,7 +42,8 @@ class FitConfig:
         fps: fit frames a second at most. subject_px: size of the subject in working pixels (root of its area).
         width: neurons of the hidden layers of Q and G. joint_hz, root_hz: highest frequency of their time features.
         quality: draft, normal or high: how long it works on it.
-        iterations: of the heading, gait, rivals, final and limbs phase; none: as the quality says.
+        iterations: of the heading, gait, rivals, final and limbs phase (the phase overtaking has those of final, where
+            limbs has any); none: as the quality says.
         candidates: hypotheses that are fitted in the gait phase, at least one without a gait for each heading that is
             left (one or two); gait_phases: phases tried of each gait.
         tilt_moving_deg, tilt_static_deg: s.d. of the given gravity for a camera that moved, and for one that did not.
@@ -89,8 +90,10 @@ class FitConfig:
             raise UsageError("must be 0 (typical) or a length in m", where="length_m", valid=["0", "0.2 ... 3"])
         if self.quality not in ITERATIONS:
             raise UsageError(f"quality is {self.quality!r}", where="quality", valid=ITERATIONS)
-        if self.iterations and len(self.iterations) != len(fitting.PHASES):
-            raise UsageError("needs one number for each phase", where="iterations", valid=fitting.PHASES)
+        if self.iterations and len(self.iterations) != fitting.LIMBS + 1:
+            raise UsageError(
+                "needs one number for each phase", where="iterations", valid=fitting.PHASES[: fitting.LIMBS + 1]
+            )
         if self.iterations and (min(self.iterations) < 0 or max(self.iterations) == 0):
             raise UsageError("needs numbers of at least 0, one of them more", where="iterations")
         if self.skeleton not in (AUTO, *list_skeletons()):
@@ -248,13 +251,15 @@ def one_thread() -> Iterator[None]:
 def _effort(config: FitConfig) -> fitting.Effort:
     heading, gait, rivals, final, limbs = config.iterations or ITERATIONS[config.quality]
     skeleton = tuple(f"shape.{k}" for k in ("log_length", "group", "node", "shift", "radius", "girth"))
+    last = Schedule(final, 48, 300, (*skeleton, "Q", "G", "tilt"), late=("shape.flesh",))
     return fitting.Effort(
         schedules=(
             Schedule(heading, 12, 160, ("G", "shape.log_length", "shape.group", "shape.girth")),
             Schedule(gait, 16, 160, (*skeleton, "Q", "G", "tilt"), stance=1.0),
             Schedule(rivals, 32, 200, (*skeleton, "Q", "G", "tilt"), stance=0.0),
-            Schedule(final, 48, 300, (*skeleton, "Q", "G", "tilt"), late=("shape.flesh",)),
+            last,
             Schedule(limbs, 48, 300, (*skeleton, "shape.flesh", "Q", "G", "tilt"), rate=AGAIN),
+            last if limbs else replace(last, iterations=0),
         ),
         candidates=config.candidates,
         phases_of_gait=config.gait_phases,

@@ -10,11 +10,12 @@ from scipy.signal import find_peaks
 
 from slomo.reconstruct.hypotheses import as_guess, exchanged, leg_pairs
 from slomo.reconstruct.problem import Problem, Variables, rank
-from slomo.reconstruct.sides import OPEN, doubting, feet, unsettled
+from slomo.reconstruct.sides import doubting, feet, unsettled
 from slomo.reconstruct.trajectory import Guess
 
 Array = np.ndarray
 
+OPEN = 0.15  # share by which the loss may be higher with nothing fitted to it, to be tried
 NEARER = 0.35  # of how far apart feet are in the median, by which they come nearer where they meet
 _MOMENT = 0.02  # s, of which that is the mean
 
@@ -24,7 +25,7 @@ def overtaking(problem: Problem, x: Variables, guess: Guess) -> list[tuple[str, 
     pair's name, where the picture is hardly worse for it."""
     if len(problem.obs.at) < 3:
         return []
-    judge, (x, plain) = doubting(unsettled(problem)), as_guess(problem, x, guess)
+    judge, (x, plain) = doubting(unsettled(problem), 0.0), as_guess(problem, x, guess)
     t, own, out = problem.obs.t.numpy(), feet(problem, x, plain)[0].numpy(), []
     at = t[problem.obs.at.numpy()]
     limit = (1 + OPEN) * float(rank(judge, x, plain)[0])

@@ -19,7 +19,7 @@ class Run:
     """Where a fit stands; all of it is in a checkpoint.
 
     Attributes:
-        phase: index into `fit.PHASES`, or one more. x, guess: of its H hypotheses. labels: what each hypothesis is.
+        phase: index into `fit.PHASES`. x, guess: of its H hypotheses. labels: what each hypothesis is.
         log: what was decided so far, for the report.
     """
 
@@ -32,7 +32,7 @@ class Run:
     @property
     def loss(self) -> float:
         """Of the winner, once there is one."""
-        return self.log["limbs"][0]["loss"]
+        return self.log.get("overtaking", self.log["limbs"])[0]["loss"]
 
 
 def as_arrays(run: Run) -> dict[str, np.ndarray]:

@@ -25,13 +25,13 @@ CHANGED = math.radians(60)  # by which a pair's joints must move less in sum, mi
 _SIDED = ("keypoints", "parts", "surface")
 
 
-def doubting(problem: Problem) -> Problem:
-    """The problem by which fitted motions are compared: what networks say of joints, parts and surface has less weight.
-    Key points of the user's own keep theirs."""
+def doubting(problem: Problem, share: float = BELIEVED) -> Problem:
+    """The problem by which fitted motions are compared: what networks say of joints, parts and surface has a `share` of
+    its weight. Key points of the user's own keep theirs."""
     said, mirror = problem.said, torch.tensor(problem.kin.skeleton.mirror)
     own = said is not None and bool((mirror[said.node] != said.node)[said.alone].any())  # theirs have a side for sure
     sided = [k for k in _SIDED if not (own and k == "keypoints")]
-    return replace(problem, weights={k: w * (BELIEVED if k in sided else 1) for k, w in problem.weights.items()})
+    return replace(problem, weights={k: w * (share if k in sided else 1) for k, w in problem.weights.items()})
 
 
 def unsettled(problem: Problem) -> Problem:

@@ -40,24 +40,24 @@ def give_back_surroundings(frames: np.ndarray, layers: dict[int, np.ndarray], fl
         return 0
     model = learn_colours(frames, {k: bodies[k] for k in trusted}, reach=2.0)
     colour = lambda k: cv2.GaussianBlur(model(to_lab(frames[k])), (0, 0), 1.5)  # noqa: E731
-    along: dict[int, np.ndarray] = {}
+    own: dict[int, np.ndarray] = {}  # patches of the masks that are cut anew which move along
     for k in area:
         if (patches := _foreign(bodies[k], colour(k))).sum() > _FOREIGN * area[k]:
-            own = _along(k, bodies, flow, motion)
-            if (patches & ~own).sum() > _FOREIGN * area[k]:
-                along[k] = own
-    for k, own in along.items():
+            staying = _staying(patches, k, bodies, flow, motion)
+            if staying.sum() > _FOREIGN * area[k]:
+                own[k] = patches & ~staying
+    for k, patches in own.items():
         # The network has shown here that it does not know, so colour outweighs it.
         logit = 2.0 * (np.clip(colour(k), -2.0, 2.0) - 0.5) + layers[k] - 0.5
         probability = np.where(grown(bodies[k], 0.1), 1.0 / (1.0 + np.exp(-logit)), 0.0)
-        layers[k] = (cut(frames[k], probability) | (own & bodies[k])).astype(np.float16)
-    if along:
+        layers[k] = (cut(frames[k], probability) | patches).astype(np.float16)
+    if own:
         left = {k: float((p > 0.5).sum()) for k, p in layers.items()}
         trusted_area = np.median([area[k] for k in trusted])
-        for k in along:
+        for k in own:
             if left[k] < 0.5 * trusted_area and len(layers) > len(left) // 3:
                 del layers[k]
-    return len(along)
+    return len(own)
 
 
 def give_back_patches(frames: np.ndarray, layers: dict[int, np.ndarray], flow: Flow, motion: SharedMotion) -> int:

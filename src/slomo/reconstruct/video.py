@@ -52,8 +52,7 @@ def decode(
         duration: s; 0 means up to the end.
         fps: upper bound of the frame rate. A slower source keeps its own; of a faster one every n-th frame is taken if
             its rate is constant, else the frames nearest to a grid at `fps`.
-        enlarge: a smaller clip is enlarged, by that much at most, unless it would be too long then.
-        megapixels: million pixels of all frames together, the bound on memory; see `fit_in`.
+        enlarge: by that much at most, a smaller clip.  megapixels: million pixels of all frames together; see `fit_in`.
 
     Raises:
         InvalidData: the file is no video, holds no frame in the wanted span, or fewer than 8.
@@ -116,9 +115,8 @@ def decode(
 def fit_in(
     frames: int, rate: float, size: tuple[float, float], max_side: int, enlarge: float, megapixels: float
 ) -> tuple[int, float, int]:
-    """What is taken of a clip. A small one is enlarged if that fits in. Of a long one every n-th frame is taken first,
-    though no fewer than `LEAST_FPS` a second; then smaller frames, though no smaller than `LEAST_SIDE`; what is still
-    too much is left out at the end.
+    """What is taken of a clip. A small one is enlarged as far as that fits in. Of a long one every n-th frame, no fewer
+    than `LEAST_FPS` a second; then smaller frames, no smaller than `LEAST_SIDE`; the end is left out if need be.
 
     Args:
         frames: wanted, `rate` of them a second.  size: px, of the source, width and height.
@@ -128,10 +126,10 @@ def fit_in(
     """
     budget, longer = 1e6 * megapixels, max(size)
     flat = min(size) / longer
-    large = min(max_side, enlarge * longer)
-    if frames * flat * large**2 <= budget:
-        return 1, large, frames
     own = min(max_side, longer)
+    large = min(max_side, enlarge * longer, np.sqrt(budget / (max(1, frames) * flat)))
+    if large >= own:
+        return 1, float(large), frames
     most = max(1, int(rate / LEAST_FPS))
     every = next((n for n in range(1, most) if -(-frames // n) * flat * own**2 <= budget), most)
     taken = -(-frames // every)
@@ -296,8 +294,7 @@ def _to_rgb(frame: av.VideoFrame, aspect: float, side: float) -> np.ndarray:
     """(H, W, 3) uint8, square pixels, the longer side of `side` px, upright."""
     width, height = frame.width * aspect, float(frame.height)
     scale = side / max(width, height)
-    # Even sizes keep video encoders of the later stages content.
-    width, height = (max(2, 2 * round(scale * n / 2)) for n in (width, height))
+    width, height = (max(2, 2 * round(scale * n / 2)) for n in (width, height))  # even, for encoders
     how = "BICUBIC" if scale > 1 else "AREA"
     rgb = frame.reformat(width=width, height=height, format="rgb24", interpolation=how).to_ndarray()
     return np.ascontiguousarray(np.rot90(rgb, round(frame.rotation / 90) % 4))
