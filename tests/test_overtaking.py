@@ -81,7 +81,14 @@ def test_what_the_picture_denies_is_not_tried(monkeypatch):
     assert overtaking(problem, x, true) == []
 
 
-@pytest.mark.parametrize(("more", "loss"), [({}, 0.5), ({"overtaking": [{"loss": 0.4}]}, 0.4)])
-def test_the_loss_of_a_run_is_that_of_its_last_phase(more: dict, loss: float):
+@pytest.mark.parametrize(("wins", "loss"), [(True, 0.4), (False, 0.5)])
+def test_who_was_the_best_stays_as_it_was_unless_it_is_beaten(wins: bool, loss: float):
     _, _, x, _, guess = walking(slice(0, 0))
-    assert Run(fit.LIMBS, x, guess, [{}], {"limbs": [{"loss": 0.5}], **more}).loss == loss
+    now = {k: v + 1 for k, v in x.items()}
+    label = {"overtaking": "hind"} if wins else {}
+    log = {"limbs": [{"loss": 0.5}], "overtaking": [label | {"loss": 0.4}]}
+    run = fit._as_it_was(Run(fit.LIMBS + 1, now | {fit.BEFORE + k: v for k, v in x.items()}, guess, [label], log))
+    assert run.x.keys() == x.keys()
+    for k, v in run.x.items():
+        torch.testing.assert_close(v, now[k] if wins else x[k], rtol=0, atol=0)
+    assert run.loss == loss

@@ -26,6 +26,7 @@ ELSEWHERE = 0.1  # body lengths between the feet of two hypotheses that move the
 _MOTION = ("gait", "legs", "seen")
 PHASES = ("heading", "gait", "rivals", "final", "limbs", "overtaking")
 LIMBS = PHASES.index("limbs")  # the last phase of most clips
+BEFORE = "before."  # prefix of the variables of the best one before the phase overtaking
 FINAL = PHASES.index("final")  # from there on little is between two hypotheses, and many draws tell them apart
 
 
@@ -72,7 +73,7 @@ def fit(
             label | {"loss": round(float(v), 4)} for label, v in zip(run.labels, losses, strict=True)
         ]
         if run.phase > LIMBS:
-            return _winner(run, _by_picture(at, run))
+            return _as_it_was(_winner(run, _by_picture(at, run)))
         step = (_to_gait, _to_rivals, _to_final, _to_limbs, _to_overtaking)[run.phase]
         run = step(problem, run, losses, root, effort, metres, progress)
         if run.phase > LIMBS and len(run.labels) == 1:
@@ -241,8 +242,18 @@ def _to_overtaking(problem: Problem, run: Run, losses: Tensor, root: RootGuess, 
     if root.travelled > 1 and effort.schedules[-1].iterations:
         rivals += overtaking(problem, best.x, best.guess)
     x = {k: torch.cat([x[k] for _, x, _ in rivals]) for k in best.x}
+    if len(rivals) > 1:
+        x |= {BEFORE + k: torch.cat([v] * len(rivals)) for k, v in best.x.items()}
     labels = [best.labels[0] | ({"overtaking": name} if name else {}) for name, *_ in rivals]
     return Run(run.phase + 1, x, join([guess for _, _, guess in rivals]), labels, run.log)
+
+
+def _as_it_was(run: Run) -> Run:
+    """The winner; where that is the one that was the best before, as it was then: it went on for comparison only, and
+    shapes go on changing long after motions have settled."""
+    before = {k.removeprefix(BEFORE): v for k, v in run.x.items() if k.startswith(BEFORE)}
+    now = {k: v for k, v in run.x.items() if not k.startswith(BEFORE)}
+    return replace(run, x=now if "overtaking" in run.labels[0] else before)
 
 
 def _winner(run: Run, losses: Tensor) -> Run:

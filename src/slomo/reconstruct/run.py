@@ -32,7 +32,8 @@ class Run:
     @property
     def loss(self) -> float:
         """Of the winner, once there is one."""
-        return self.log.get("overtaking", self.log["limbs"])[0]["loss"]
+        last = self.log.get("overtaking", [{}])[0]
+        return (last if "overtaking" in last else self.log["limbs"][0])["loss"]
 
 
 def as_arrays(run: Run) -> dict[str, np.ndarray]:
