@@ -375,7 +375,7 @@ def test_who_travels_takes_steps_unless_it_looks_much_better_without(scene: Scen
     x = {k: v.repeat(2, *[1] * (v.ndim - 1)) for k, v in scene.x.items()}
     run = Run(3, x, join([_guess(phase=0.1)] * 2), labels, {"final": list(labels)})
     root = _went(travelled)
-    effort = fit.Effort((Schedule(0, 1, 2, ()),), 8, 12)  # no time for limbs
+    effort = fit.Effort((Schedule(0, 1, 2, ()),) * len(fit.PHASES), 8, 12)  # no time for limbs
     best = fit._to_limbs(scene.problem(None, {"mask": 1.0}), run, torch.tensor([1.0, walk]), root, effort)
     assert [label["gait"] for label in best.labels] == [wins]
     assert best.log["final"][0]["gait"] == wins
