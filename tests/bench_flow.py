@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slomo.reconstruct.decode_stage import DecodeConfig
+from slomo.reconstruct import decode_stage
 from slomo.reconstruct.flow import dense_flow
 from slomo.reconstruct.stage import pack
 from slomo.reconstruct.subject_flow import closer, merged
@@ -34,7 +34,7 @@ def main() -> None:
             truth = dict(z)
         with np.load(folder / "masks.npz") as z:
             masks = np.unpackbits(z["packed"], axis=-1)[..., : z["shape"][2]].astype(bool)
-        frames = decode(folder / "clip.mp4", enlarge=DecodeConfig().enlarge).frames
+        frames = decode(folder / "clip.mp4", enlarge=decode_stage.Config().enlarge).frames
         if frames.shape[:3] != masks.shape:
             raise SystemExit(f"{folder}: masks of another size than the frames that are decoded")
         uv, moved = points(truth)

@@ -16,7 +16,7 @@ from scipy.stats import spearmanr
 
 from mask_cases import CASES, make_case
 from slomo.errors import SlomoError
-from slomo.reconstruct.decode_stage import DecodeConfig, run_decode
+from slomo.reconstruct import decode_stage
 from slomo.reconstruct.stage import MasksConfig, run_masks, unpack
 from slomo.stage import Artifact, Inputs, Silent
 
@@ -34,7 +34,7 @@ def clips(only: set[str]):
         if not (folder / "clip.mp4").exists():
             print(f"{folder.name:14s} skipped: {folder} is absent")
             continue
-        decoded = run_decode(Inputs(files={"clip": folder / "clip.mp4"}), DecodeConfig(), Silent())
+        decoded = decode_stage.run(Inputs(files={"clip": folder / "clip.mp4"}), decode_stage.Config(), Silent())
         frames = decoded.npz["frames.npz"]["frames"]
         with np.load(folder / "masks.npz") as z:
             given = unpack(z)

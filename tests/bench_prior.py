@@ -20,7 +20,7 @@ from slomo.prior import metrics
 from slomo.prior.evaluate import Truth, judge, predict, truth_of
 from slomo.prior.inference import Prior, packaged, peaks
 from slomo.prior.labels import Labels, labels, view_of
-from slomo.reconstruct.decode_stage import DecodeConfig
+from slomo.reconstruct import decode_stage
 from slomo.reconstruct.video import decode
 from slomo.skeleton import load_skeleton
 
@@ -144,7 +144,7 @@ def main() -> None:
             continue
         known, prior = labels(load_skeleton(kind)), Prior(path)
         clip = decode(
-            folder / "clip.mp4", enlarge=DecodeConfig().enlarge
+            folder / "clip.mp4", enlarge=decode_stage.Config().enlarge
         )  # as the stage does, so that its pixels are the bench's
         frames = clip.frames
         decided, estimated = evidence(options.projects / folder.name, folder / "clip.mp4", kind, path)

@@ -17,7 +17,7 @@ from slomo import pipeline
 from slomo.errors import InvalidData, UsageError
 from slomo.stage import Artifact, Inputs, Progress
 
-DECODE_VERSION = MASKS_VERSION = CAMERA_VERSION = FIT_VERSION = REFINE_VERSION = VERSION = 1
+MASKS_VERSION = CAMERA_VERSION = FIT_VERSION = REFINE_VERSION = VERSION = 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,6 +181,7 @@ def replacements() -> dict[str, pipeline.StageSpec]:
     """The table with these stages."""
     real = {n: s for n, s in pipeline.STAGES.items() if n != "import"}
     own = {"report": {"run": "run_report"}, "evidence": {"run": "run_evidence", "config": "EvidenceConfig"}}
+    own |= {"decode": {"run": "run_decode", "config": "DecodeConfig"}}
     own |= {"trials": {"config": "TrialsConfig"}, "replay": {"config": "ReplayConfig"}}
     return {n: dataclasses.replace(s, module="fake_line", **own.get(n, {})) for n, s in real.items()}
 

@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slomo.errors import UsageError
+from slomo.reconstruct import decode_stage
 from slomo.reconstruct.camera import CameraSettings, estimate_camera
-from slomo.reconstruct.decode_stage import DecodeConfig, run_decode
 from slomo.reconstruct.ground import find_ground, gravity_from_lines
 from slomo.reconstruct.resection import interpolate_poses
 from slomo.reconstruct.stage import CameraConfig, pack, run_camera
@@ -182,7 +182,7 @@ def test_moving_camera_of_truth_clips(name):
     folder = SHARED / "truth" / name
     if not folder.exists():
         pytest.skip("needs ../shared/truth")
-    decoded = run_decode(Inputs(files={"clip": folder / "clip.mp4"}), DecodeConfig(), Silent())
+    decoded = decode_stage.run(Inputs(files={"clip": folder / "clip.mp4"}), decode_stage.Config(), Silent())
     with np.load(folder / "masks.npz") as z:
         masks = Artifact(npz={"masks.npz": dict(z)})
     out = run_camera(Inputs(artifacts={"decode": decoded, "masks": masks}), CameraConfig(), Silent())

@@ -4,7 +4,7 @@ import av
 import numpy as np
 import pytest
 
-from slomo.reconstruct.decode_stage import DecodeConfig, run_decode
+from slomo.reconstruct import decode_stage
 from slomo.reconstruct.exposure import FLAT, FULL, MOST, stretch
 from slomo.stage import Inputs
 from test_video import Notes
@@ -63,7 +63,7 @@ def test_a_dark_clip_is_decoded_brighter_and_that_is_said(tmp_path):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         container.mux(stream.encode())
     notes = Notes()
-    artifact = run_decode(Inputs(files={"clip": path}), DecodeConfig(), notes)
+    artifact = decode_stage.run(Inputs(files={"clip": path}), decode_stage.Config(), notes)
     assert artifact.json["video.json"]["contrast"] == pytest.approx(FULL / 50, rel=0.1)
     assert artifact.npz["frames.npz"]["frames"].max() > 180
     assert any("dark" in note for note in notes.notes)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slomo.errors import InvalidData, UsageError
-from slomo.reconstruct.decode_stage import DecodeConfig, run_decode
+from slomo.reconstruct import decode_stage
 from slomo.reconstruct.flow import dense_flow
 from slomo.reconstruct.instances_motion import SharedMotion
 from slomo.reconstruct.motion_segment import border_distance
@@ -326,7 +326,7 @@ def shared(*parts: str) -> Path:
 def test_network_on_the_camel():
     """The bar of the first light: mean IoU of 0.80 with the camel's truth."""
     clip, weights = shared("clips", "camel"), shared("weights", "u2netp.onnx")
-    decoded = run_decode(Inputs(files={"clip": clip / "clip.mp4"}), DecodeConfig(), Silent())
+    decoded = decode_stage.run(Inputs(files={"clip": clip / "clip.mp4"}), decode_stage.Config(), Silent())
     out = run_masks(Inputs(artifacts={"decode": decoded}, files={"weights": weights}), MasksConfig(), Silent())
     masks = unpack(out.npz["masks.npz"])
     with np.load(clip / "masks.npz") as z:
@@ -339,7 +339,7 @@ def test_network_on_the_camel():
 @pytest.mark.slow
 def test_motion_on_the_embedded_clip():
     """`make demo` has no network: motion alone has to do."""
-    decoded = run_decode(Inputs(files={"clip": ASSET / "clip.mp4"}), DecodeConfig(), Silent())
+    decoded = decode_stage.run(Inputs(files={"clip": ASSET / "clip.mp4"}), decode_stage.Config(), Silent())
     out = run_masks(Inputs(artifacts={"decode": decoded}), MasksConfig(segmenter="motion"), Silent())
     with np.load(ASSET / "masks.npz") as z:
         truth = unpack(z)

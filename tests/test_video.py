@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slomo.errors import InvalidData, UsageError
-from slomo.reconstruct.decode_stage import DecodeConfig, run_decode
+from slomo.reconstruct import decode_stage
 from slomo.reconstruct.video import decode, fit_in
 from slomo.stage import Inputs, Silent
 
@@ -176,7 +176,7 @@ def test_truncated_clip_gives_what_there_is(tmp_path):
     data = path.read_bytes()
     path.write_bytes(data[: int(0.6 * len(data))])
     notes = Notes()
-    artifact = run_decode(Inputs(files={"clip": path}), DecodeConfig(), notes)
+    artifact = decode_stage.run(Inputs(files={"clip": path}), decode_stage.Config(), notes)
     kept = len(artifact.npz["frames.npz"]["t"])
     info = artifact.json["video.json"]
     assert 8 <= kept < 90
@@ -190,4 +190,4 @@ def test_truncated_clip_gives_what_there_is(tmp_path):
 
 def test_parameters_out_of_range(tmp_path):
     with pytest.raises(UsageError, match=r"decode\.fps"):
-        run_decode(Inputs(files={"clip": tmp_path / "a.mp4"}), DecodeConfig(fps=0.0), Silent())
+        decode_stage.run(Inputs(files={"clip": tmp_path / "a.mp4"}), decode_stage.Config(fps=0.0), Silent())

@@ -73,10 +73,7 @@ _RECONSTRUCT = "slomo.reconstruct.stage"
 STAGES: dict[str, StageSpec] = {
     s.name: s
     for s in (
-        StageSpec(
-            "decode", "slomo.reconstruct.decode_stage", "reconstruct", "run_decode", "DecodeConfig", "DECODE_VERSION",
-            (), ("clip",),
-        ),
+        StageSpec("decode", "slomo.reconstruct.decode_stage", "reconstruct", files=("clip",)),
         StageSpec(
             "masks", _RECONSTRUCT, "reconstruct", "run_masks", "MasksConfig", "MASKS_VERSION", ("decode",),
             optional=("masks", "weights"), shares=("quality",),

@@ -8,11 +8,11 @@ from slomo.reconstruct.exposure import stretch
 from slomo.reconstruct.video import decode
 from slomo.stage import Artifact, Inputs, Progress
 
-DECODE_VERSION = 6
+VERSION = 6
 
 
 @dataclass(frozen=True)
-class DecodeConfig:
+class Config:
     """What is taken from the clip.
 
     Attributes:
@@ -33,7 +33,7 @@ class DecodeConfig:
     megapixels: float = 280.0
 
 
-def run_decode(inputs: Inputs, config: DecodeConfig, progress: Progress) -> Artifact:
+def run(inputs: Inputs, config: Config, progress: Progress) -> Artifact:
     """Decode the file "clip" into `frames.npz` (frames (T, H, W, 3) uint8 RGB, t (T,) s) and `video.json`; frames of a
     dark or hazy clip with their contrast stretched (`exposure`).
 
