@@ -53,12 +53,13 @@ def fit(
     run, start, adam_state = restore(progress.load(), generator)
     if run is None:
         run = starts.start(problem, root, generator)
-    total = total_cost(effort)
     while True:
-        schedule = effort.schedules[run.phase]
+        schedule, total = effort.schedules[run.phase], _total_cost(effort, run.phase)
         done = sum(s.iterations * _cost(s) for s in effort.schedules[: run.phase])
 
-        def each(i: int, optimiser: torch.optim.Adam, loss: Tensor, run=run, schedule=schedule, done=done) -> None:
+        def each(
+            i: int, optimiser: torch.optim.Adam, loss: Tensor, run=run, schedule=schedule, done=done, total=total
+        ) -> None:
             fraction = (done + i * _cost(schedule)) / total
             progress.update(fraction, f"{PHASES[run.phase]} {i}/{schedule.iterations}, loss {float(loss.min()):.3f}")
             if progress.checkpoint_due():
@@ -103,8 +104,9 @@ def _cost(schedule: Schedule) -> float:
     return schedule.frames * schedule.pixels + 2000
 
 
-def total_cost(effort: Effort) -> float:
-    return sum(s.iterations * _cost(s) for s in effort.schedules)
+def _total_cost(effort: Effort, phase: int) -> float:
+    """Of what is known to come in a `phase`: most clips end with the limbs."""
+    return sum(s.iterations * _cost(s) for s in effort.schedules[: max(phase, LIMBS) + 1])
 
 
 def _to_gait(
@@ -118,7 +120,7 @@ def _to_gait(
 ) -> Run:
     """The best few of the gaits over the best headings."""
     first = effort.schedules[0]
-    done = first.iterations * _cost(first) / total_cost(effort)
+    done = first.iterations * _cost(first) / _total_cost(effort, run.phase)
     return gaits.tried(
         problem, run, losses, root, candidates=effort.candidates, phases=effort.phases_of_gait, metres=metres,
         trying=lambda what: progress.update(done, what),
