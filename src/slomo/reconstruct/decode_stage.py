@@ -8,7 +8,7 @@ from slomo.reconstruct.exposure import stretch
 from slomo.reconstruct.video import decode
 from slomo.stage import Artifact, Inputs, Progress
 
-VERSION = 6
+VERSION = 7
 
 
 @dataclass(frozen=True)

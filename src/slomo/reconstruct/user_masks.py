@@ -53,7 +53,8 @@ class UserMasks:
                     where=path,
                     todo="give masks with the frames' proportions",
                 )
-            out[i] = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
+            how = cv2.INTER_AREA if mask.shape[1] > width else cv2.INTER_LINEAR  # areas make steps where they enlarge
+            out[i] = cv2.resize(mask.astype(np.float32), (width, height), interpolation=how) > 0.5
             progress((i + 1) / len(masks))
         if not out.any():
             raise no_subject(f"all masks in {path} are empty")

@@ -130,7 +130,7 @@ def fit_in(
     large = min(max_side, enlarge * longer, np.sqrt(budget / (max(1, frames) * flat)))
     if large >= own:
         return 1, float(large), frames
-    most = max(1, int(rate / LEAST_FPS))
+    most = max(1, min(int(rate / LEAST_FPS), frames // MIN_FRAMES))
     every = next((n for n in range(1, most) if -(-frames // n) * flat * own**2 <= budget), most)
     taken = -(-frames // every)
     if taken * flat * own**2 <= budget:
