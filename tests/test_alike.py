@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from slomo.reconstruct import alike, hypotheses
+from slomo.reconstruct import alike, fit, hypotheses
 from slomo.reconstruct.kinematics import Kinematics
+from slomo.reconstruct.problem import Schedule, rank
+from slomo.reconstruct.run import Run
 from slomo.skeleton import load_skeleton
 from test_fit_people import FPS, T, problem_of
 
@@ -29,12 +31,17 @@ def raising(strides) -> np.ndarray:
     return q
 
 
-def done(seen, fitted, frequencies=(FPS / STRIDE,)) -> np.ndarray | None:
-    """(T,) degrees of the elbow after strides were borrowed; a paw is seen up in some strides and fitted so in some."""
+def of(seen, fitted):
+    """A paw is seen up in some strides and fitted so in some."""
     problem, root = problem_of(np.zeros(T), raising(seen), skeleton="quadruped", centre=CENTRE)
     guess = hypotheses.placed(problem.kin, root, np.zeros((1, T)))
     guess = replace(guess, q=torch.as_tensor(raising(fitted), dtype=torch.float32)[None])
-    x = problem.variables(1, torch.Generator().manual_seed(0))
+    return problem, root, problem.variables(1, torch.Generator().manual_seed(0)), guess
+
+
+def done(seen, fitted, frequencies=(FPS / STRIDE,)) -> np.ndarray | None:
+    """(T,) degrees of the elbow after strides were borrowed."""
+    problem, _, x, guess = of(seen, fitted)
     found = alike.borrowed(problem, x, guess, clock=CLOCK, frequencies=frequencies)
     elbow = problem.kin.skeleton.names.index("front_right_elbow")
     return None if found is None else np.degrees(found[1].q[0, :, elbow, 1].numpy())
@@ -52,6 +59,30 @@ def test_a_step_that_is_missed_is_done_as_the_others(missed):
 def test_a_step_that_is_seen_to_be_another_stays_so():
     assert done(seen=[0, 1, 3], fitted=[0, 1, 3]) is None
     assert done(seen=range(4), fitted=range(4)) is None
+
+
+def test_once_the_limbs_are_fitted_strides_are_borrowed_again(monkeypatch):
+    """Beside the best one, whose strides may be borrowed ones already. Where there is nothing to borrow, or no time for
+    it, the fit is at its end."""
+    label = {"gait": "walk", "stride_hz": FPS / STRIDE, "strides": "alike"}
+    effort = fit.Effort((Schedule(1, 2, 8, ()),) * len(fit.PHASES), 1, 1)
+
+    def after_limbs(fitted, effort=effort):
+        problem, root, x, guess = of(range(4), fitted)
+        run = Run(fit.LIMBS, x, guess, [label], {"limbs": [{}]})
+        return fit._to_alike(problem, run, rank(problem, x, guess), replace(root, travelled=3.0), effort)
+
+    monkeypatch.setattr(fit, "overtaking", lambda *a: [])
+    beside = after_limbs([0, 1, 3])
+    assert (fit.PHASES[beside.phase], beside.labels) == ("alike", [label, label | {"alike": "again"}])
+    elbow = load_skeleton("quadruped").names.index("front_right_elbow")
+    assert float(beside.guess.q[1, 2 * STRIDE + 3, elbow, 1].rad2deg()) < -60
+    hasty = replace(effort, schedules=tuple(replace(s, iterations=0) for s in effort.schedules))
+    for alone in (after_limbs(range(4)), after_limbs([0, 1, 3], hasty)):
+        assert (alone.phase, alone.labels) == (len(fit.PHASES), [label])
+    # Of strides that the picture does not tell apart the alike ones win.
+    near = fit._alike(beside, torch.tensor([1.0, 1.005]))
+    assert near[1] < near[0]
 
 
 def test_without_two_strides_nothing_is_borrowed():

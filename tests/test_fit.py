@@ -176,28 +176,37 @@ class Stops(Silent):
         return json.loads(bytes(self.saved["meta"]))["phase"]  # pyright: ignore[reportOptionalSubscript]
 
 
-@pytest.mark.parametrize(("saves", "overtakes"), [(1, False), (5, False), (7, True)])
-def test_an_interrupted_fit_resumes_to_the_same_bits(walk, monkeypatch, saves: int, overtakes: bool):
-    """In the phase that few clips get to, too: what is chosen there is what the report is of."""
+@pytest.mark.parametrize(
+    ("saves", "phase", "more"),
+    [(1, "heading", ()), (5, "final", ()), (7, "alike", ("alike",)), (8, "overtaking", ("alike", "overtaking"))],
+)
+def test_an_interrupted_fit_resumes_to_the_same_bits(walk, monkeypatch, saves: int, phase: str, more: tuple[str, ...]):
+    """In the phases that few clips get to, too: what is chosen there is what the report is of."""
     _, masks, flow = walk
-    legs = lambda *motion: [("hind", *hypotheses.exchanged(*motion))] if overtakes else []  # noqa: E731
-    monkeypatch.setattr(fit, "overtaking", legs)
+    legs = lambda *motion: [("hind", *hypotheses.exchanged(*motion))]  # noqa: E731
+    monkeypatch.setattr(fit, "overtaking", legs if "overtaking" in more else lambda *a: [])
+    strides = lambda _, x, guess, **k: (x, guess)  # noqa: E731
+    monkeypatch.setattr(fit.alike, "borrowed", strides if "alike" in more else lambda *a, **k: None)
     whole = reconstruct(_inputs(masks, flow), TINY, Silent())
     first = Stops(saves)
     with pytest.raises(KeyboardInterrupt):
         reconstruct(_inputs(masks, flow), TINY, first)
+    assert fit.PHASES[first.saved_phase()] == phase
     again = reconstruct(_inputs(masks, flow), TINY, Stops(99, first.saved))
     for k, v in whole.npz["keypoints.npz"].items():
         np.testing.assert_array_equal(again.npz["keypoints.npz"][k], v, err_msg=k)
-    report = whole.json["report.json"]
-    assert again.json["report.json"]["search"] == report["search"]
-    assert ("overtaking" in report["search"]) == overtakes
-    last, by = (report["search"]["overtaking"], "picture") if overtakes else (report["search"]["limbs"], "loss")
-    assert last == sorted(last, key=lambda e: e[by])
-    assert {k: v for k, v in last[0].items() if k not in ("loss", "picture")} == report["hypothesis"]
-    if overtakes:
-        assert [entry.get("overtaking") for entry in last].count("hind") == 1
-        assert fit.PHASES[first.saved_phase()] == "overtaking"
+    search = whole.json["report.json"]["search"]
+    assert again.json["report.json"]["search"] == search
+    assert tuple(name for name in ("alike", "overtaking") if name in search) == more
+    for name in more:
+        assert [name in entry for entry in search[name]].count(True) == 1
+    last, by = (
+        (search["overtaking"], "picture") if "overtaking" in more else (search[more[-1] if more else "limbs"], "loss")
+    )
+    hypothesis = whole.json["report.json"]["hypothesis"]
+    assert hypothesis in [{k: v for k, v in entry.items() if k not in ("loss", "picture")} for entry in last]
+    if by == "picture":
+        assert last == sorted(last, key=lambda e: e[by])
 
 
 def test_without_time_for_them_no_limbs_are_moved(walk):

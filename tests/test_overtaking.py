@@ -9,7 +9,7 @@ import torch
 from slomo.reconstruct import fit, hypotheses
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.overtaking import every_other, overtaking
-from slomo.reconstruct.problem import Schedule, rank
+from slomo.reconstruct.problem import Schedule
 from slomo.reconstruct.run import Run
 from slomo.skeleton import load_skeleton
 from test_fit_people import FPS, T, problem_of
@@ -65,12 +65,13 @@ def test_hind_legs_that_change_names_are_tried_as_legs_that_overtake_each_other(
     # It goes on beside the best one, of who travels and where there is time for it.
     run = Run(fit.LIMBS, x, shuffled, [{"gait": "none"}], {"limbs": [{}]})
     effort = fit.Effort(tuple(Schedule(1, 2, 8, ()) for _ in fit.PHASES), 1, 1)
-    losses = rank(problem, x, shuffled)
-    goes = lambda root, effort: fit._to_overtaking(problem, run, losses, root, effort).labels  # noqa: E731
-    assert goes(replace(root, travelled=3.0), effort) == [{"gait": "none"}, {"gait": "none", "overtaking": "hind"}]
-    assert len(goes(root, effort)) == 1
+    goes = lambda root, effort: fit._overtaking(problem, run, root, effort)  # noqa: E731
+    beside = goes(replace(root, travelled=3.0), effort)
+    assert beside.labels == [{"gait": "none"}, {"gait": "none", "overtaking": "hind"}]
+    assert fit.PHASES[beside.phase] == "overtaking"
     none = replace(effort, schedules=(*effort.schedules[:-1], Schedule(0, 2, 8, ())))
-    assert len(goes(replace(root, travelled=3.0), none)) == 1
+    for alone in (goes(root, effort), goes(replace(root, travelled=3.0), none)):
+        assert (alone.labels, alone.phase) == ([{"gait": "none"}], len(fit.PHASES))
 
 
 def test_what_the_picture_denies_is_not_tried(monkeypatch):
@@ -81,13 +82,15 @@ def test_what_the_picture_denies_is_not_tried(monkeypatch):
     assert overtaking(problem, x, true) == []
 
 
+@pytest.mark.parametrize("phase", ["alike", "overtaking"])
 @pytest.mark.parametrize(("wins", "loss"), [(True, 0.4), (False, 0.5)])
-def test_who_was_the_best_stays_as_it_was_unless_it_is_beaten(wins: bool, loss: float):
+def test_who_was_the_best_stays_as_it_was_unless_it_is_beaten(phase: str, wins: bool, loss: float):
     _, _, x, _, guess = walking(slice(0, 0))
     now = {k: v + 1 for k, v in x.items()}
-    label = {"overtaking": "hind"} if wins else {}
-    log = {"limbs": [{"loss": 0.5}], "overtaking": [label | {"loss": 0.4}]}
-    run = fit._as_it_was(Run(fit.LIMBS + 1, now | {fit.BEFORE + k: v for k, v in x.items()}, guess, [label], log))
+    label = {phase: "hind"} if wins else {}
+    log = {"limbs": [{"loss": 0.5}], phase: [label | {"loss": 0.4}]}
+    both = now | {fit.BEFORE + k: v for k, v in x.items()}
+    run = fit._as_it_was(Run(fit.PHASES.index(phase), both, guess, [label], log))
     assert run.x.keys() == x.keys()
     for k, v in run.x.items():
         torch.testing.assert_close(v, now[k] if wins else x[k], rtol=0, atol=0)

@@ -1,5 +1,6 @@
 """The fit, coarse to fine: size and trunk with headings, then gaits with the legs, then the rivals, then the winner,
 and that once more beside those with limbs where they are seen better, alike strides, or left and right exchanged.
+Then, only where there is something to compare it with, once more with alike strides and with legs that overtake.
 
 Every phase is one `optimise` of a batch of hypotheses; between phases they are ranked by loss on fixed draws and the
 best go on. All of it is deterministic by the seed, and a checkpoint within any phase resumes to the same bits.
@@ -12,8 +13,9 @@ import torch
 from slomo.reconstruct import alike, gaits, hypotheses, limb_track, sides, starts
 from slomo.reconstruct.hypotheses import RootGuess
 from slomo.reconstruct.overtaking import overtaking
-from slomo.reconstruct.problem import Problem, Schedule, optimise, pick, rank
+from slomo.reconstruct.problem import Problem, Schedule, Variables, optimise, pick, rank
 from slomo.reconstruct.run import Run, checkpoint, join, restore
+from slomo.reconstruct.trajectory import Guess
 from slomo.stage import Progress
 
 Tensor = torch.Tensor
@@ -24,9 +26,9 @@ STEPS = 0.04  # share by which the loss without a gait must be lower over more t
 ALIKE = 0.01  # share by which the loss with strides that are alike may be higher
 ELSEWHERE = 0.1  # body lengths between the feet of two hypotheses that move their legs otherwise, on average
 _MOTION = ("gait", "legs", "seen")
-PHASES = ("heading", "gait", "rivals", "final", "limbs", "overtaking")
-LIMBS = PHASES.index("limbs")  # the last phase of most clips
-BEFORE = "before."  # prefix of the variables of the best one before the phase overtaking
+PHASES = ("heading", "gait", "rivals", "final", "limbs", "alike", "overtaking")
+LIMBS = PHASES.index("limbs")  # the last phase that all clips have
+BEFORE = "before."  # prefix of the variables of the best one before a phase that comes after the limbs
 FINAL = PHASES.index("final")  # from there on little is between two hypotheses, and many draws tell them apart
 
 
@@ -53,7 +55,7 @@ def fit(
     run, start, adam_state = restore(progress.load(), generator)
     if run is None:
         run = starts.start(problem, root, generator)
-    while True:
+    while run.phase < len(PHASES):
         schedule, total = effort.schedules[run.phase], _total_cost(effort, run.phase)
         done = sum(s.iterations * _cost(s) for s in effort.schedules[: run.phase])
 
@@ -73,12 +75,9 @@ def fit(
         run.log[PHASES[run.phase]] = [
             label | {"loss": round(float(v), 4)} for label, v in zip(run.labels, losses, strict=True)
         ]
-        if run.phase > LIMBS:
-            return _as_it_was(_winner(run, _by_picture(at, run)))
-        step = (_to_gait, _to_rivals, _to_final, _to_limbs, _to_overtaking)[run.phase]
+        step = (_to_gait, _to_rivals, _to_final, _to_limbs, _to_alike, _to_overtaking, _to_the_end)[run.phase]
         run = step(problem, run, losses, root, effort, metres, progress)
-        if run.phase > LIMBS and len(run.labels) == 1:
-            return run
+    return run
 
 
 def polish(problem: Problem, run: Run, schedule: Schedule, *, seed: int, progress: Progress) -> Run:
@@ -176,7 +175,8 @@ def _stepping(run: Run, losses: Tensor, root: RootGuess) -> Tensor:
 
 def _alike(run: Run, losses: Tensor) -> Tensor:
     """(H,) losses to compare by. Where the picture leaves it open strides are alike."""
-    return losses * torch.tensor([1 - ALIKE * ("strides" in label) for label in run.labels])
+    key = "strides" if run.phase == LIMBS else "alike"
+    return losses * torch.tensor([1 - ALIKE * (key in label) for label in run.labels])
 
 
 def _by_picture(problem: Problem, run: Run) -> Tensor:
@@ -219,13 +219,9 @@ def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effor
             if found is not None:
                 rivals.append(found)
                 labels.append(labels[0] | {"limbs": "on their own"})
-        if labels[0]["gait"] != "none" or root.travelled > 1:
-            clock = gaits.steps(problem, root).clock
-            hz = [labels[0]["stride_hz"]] if "stride_hz" in labels[0] else run.log["stride_candidates_hz"]
-            found = alike.borrowed(problem, *rivals[-1], clock=clock, frequencies=hz)
-            if found is not None:
-                rivals.append(found)
-                labels.append(labels[-1] | {"strides": "alike"})
+        if (found := _borrowed(problem, run, labels[0], rivals[-1], root)) is not None:
+            rivals.append(found)
+            labels.append(labels[-1] | {"strides": "alike"})
         more = [("exchanged", *rival) for rival in sides.exchanged_pairs(problem, best.x, best.guess)]
         if _either_way(problem, root):
             more.append(("seen", "the other way", *hypotheses.turned_around(problem, best.x, best.guess)))
@@ -237,17 +233,49 @@ def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effor
     return Run(run.phase + 1, x, join([guess for _, guess in rivals]), labels, run.log)
 
 
-def _to_overtaking(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, *_) -> Run:
-    """The best one goes on and, of who travels, beside it with legs that overtake each other."""
+def _borrowed(
+    problem: Problem, run: Run, label: dict, motion: tuple[Variables, Guess], root: RootGuess
+) -> tuple[Variables, Guess] | None:
+    """A motion with its strides done as others of them, of who strides."""
+    if label["gait"] == "none" and root.travelled <= 1:
+        return None
+    hz = [label["stride_hz"]] if "stride_hz" in label else run.log["stride_candidates_hz"]
+    return alike.borrowed(problem, *motion, clock=gaits.steps(problem, root).clock, frequencies=hz)
+
+
+def _to_alike(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, *_) -> Run:
+    """The best one goes on beside itself with alike strides, which show more of it once the limbs have been fitted."""
     best = _winner(run, _alike(run, losses))
-    rivals = [("", best.x, best.guess)]
+    found = None
+    if effort.schedules[PHASES.index("alike")].iterations:
+        found = _borrowed(problem, best, best.labels[0], (best.x, best.guess), root)
+    if found is None:
+        return _overtaking(problem, best, root, effort)
+    return _beside(best, "alike", [("again", *found)])
+
+
+def _to_overtaking(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, *_) -> Run:
+    return _overtaking(problem, _as_it_was(_winner(run, _alike(run, losses))), root, effort)
+
+
+def _overtaking(problem: Problem, best: Run, root: RootGuess, effort: Effort) -> Run:
+    """Of who travels the best one goes on beside itself with legs that overtake each other."""
+    rivals = []
     if root.travelled > 1 and effort.schedules[-1].iterations:
-        rivals += overtaking(problem, best.x, best.guess)
-    x = {k: torch.cat([x[k] for _, x, _ in rivals]) for k in best.x}
-    if len(rivals) > 1:
-        x |= {BEFORE + k: torch.cat([v] * len(rivals)) for k, v in best.x.items()}
-    labels = [best.labels[0] | ({"overtaking": name} if name else {}) for name, *_ in rivals]
-    return Run(run.phase + 1, x, join([guess for _, _, guess in rivals]), labels, run.log)
+        rivals = overtaking(problem, best.x, best.guess)
+    return _beside(best, "overtaking", rivals) if rivals else replace(best, phase=len(PHASES))
+
+
+def _to_the_end(problem: Problem, run: Run, *_) -> Run:
+    return replace(_as_it_was(_winner(run, _by_picture(problem, run))), phase=len(PHASES))
+
+
+def _beside(best: Run, phase: str, rivals: list[tuple[str, Variables, Guess]]) -> Run:
+    """The best one and its rivals, each with what its label says of it under the name of the phase."""
+    x = {k: torch.cat([v, *(other[k] for _, other, _ in rivals)]) for k, v in best.x.items()}
+    x |= {BEFORE + k: torch.cat([v] * (1 + len(rivals))) for k, v in best.x.items()}
+    labels = best.labels + [best.labels[0] | {phase: name} for name, *_ in rivals]
+    return Run(PHASES.index(phase), x, join([best.guess, *(g for *_, g in rivals)]), labels, best.log)
 
 
 def _as_it_was(run: Run) -> Run:
@@ -255,7 +283,7 @@ def _as_it_was(run: Run) -> Run:
     shapes go on changing long after motions have settled."""
     before = {k.removeprefix(BEFORE): v for k, v in run.x.items() if k.startswith(BEFORE)}
     now = {k: v for k, v in run.x.items() if not k.startswith(BEFORE)}
-    return replace(run, x=now if "overtaking" in run.labels[0] else before)
+    return replace(run, x=now if PHASES[run.phase] in run.labels[0] else before)
 
 
 def _winner(run: Run, losses: Tensor) -> Run:

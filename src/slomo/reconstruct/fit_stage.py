@@ -22,7 +22,7 @@ from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import AUTO, USUAL, Skeleton, list_skeletons, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 43
+FIT_VERSION = 44
 
 AGAIN = 0.5  # share of the rates with which the winner is fitted once more, beside one with other limbs
 POLISH = 0.4  # share of the rates with which the chunks of a long clip are polished together
@@ -42,8 +42,8 @@ class FitConfig:
         fps: fit frames a second at most. subject_px: size of the subject in working pixels (root of its area).
         width: neurons of the hidden layers of Q and G. joint_hz, root_hz: highest frequency of their time features.
         quality: draft, normal or high: how long it works on it.
-        iterations: of the heading, gait, rivals, final and limbs phase (the phase overtaking has those of final, where
-            limbs has any); none: as the quality says.
+        iterations: of the heading, gait, rivals, final and limbs phase (the phase alike has those of limbs, the phase
+            overtaking those of final, where limbs has any); none: as the quality says.
         candidates: hypotheses that are fitted in the gait phase, at least one without a gait for each heading that is
             left (one or two); gait_phases: phases tried of each gait.
         tilt_moving_deg, tilt_static_deg: s.d. of the given gravity for a camera that moved, and for one that did not.
@@ -252,13 +252,15 @@ def _effort(config: FitConfig) -> fitting.Effort:
     heading, gait, rivals, final, limbs = config.iterations or ITERATIONS[config.quality]
     skeleton = tuple(f"shape.{k}" for k in ("log_length", "group", "node", "shift", "radius", "girth"))
     last = Schedule(final, 48, 300, (*skeleton, "Q", "G", "tilt"), late=("shape.flesh",))
+    more = Schedule(limbs, 48, 300, (*skeleton, "shape.flesh", "Q", "G", "tilt"), rate=AGAIN)
     return fitting.Effort(
         schedules=(
             Schedule(heading, 12, 160, ("G", "shape.log_length", "shape.group", "shape.girth")),
             Schedule(gait, 16, 160, (*skeleton, "Q", "G", "tilt"), stance=1.0),
             Schedule(rivals, 32, 200, (*skeleton, "Q", "G", "tilt"), stance=0.0),
             last,
-            Schedule(limbs, 48, 300, (*skeleton, "shape.flesh", "Q", "G", "tilt"), rate=AGAIN),
+            more,
+            more,
             last if limbs else replace(last, iterations=0),
         ),
         candidates=config.candidates,

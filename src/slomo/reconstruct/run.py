@@ -32,8 +32,8 @@ class Run:
     @property
     def loss(self) -> float:
         """Of the winner, once there is one."""
-        last = self.log.get("overtaking", [{}])[0]
-        return (last if "overtaking" in last else self.log["limbs"][0])["loss"]
+        best = {phase: self.log[phase][0] for phase in ("overtaking", "alike") if phase in self.log}
+        return next((b["loss"] for phase, b in best.items() if phase in b), self.log["limbs"][0]["loss"])
 
 
 def as_arrays(run: Run) -> dict[str, np.ndarray]:
