@@ -350,6 +350,28 @@ def test_what_a_body_has_for_as_long_as_it_is_seen_is_its_own_though_it_does_not
     assert motion.lasting(6, still[6], passed).sum() < 0.1 * still[6].sum()
 
 
+def test_a_leg_that_stood_comes_along_and_what_is_passed_is_left_behind():
+    """A body that steps from one wide leg onto the next beside a crate, which both its start and its end show."""
+
+    def leg(x, y):
+        return (abs(x) < 8) & (y > 70) & (y < 105)
+
+    def crate(x, y):
+        return (abs(x) < 12) & (y > 75) & (y < 105)
+
+    step = lambda t: 60.0 if t < 10 else min(60.0 + 8 * (t - 10), 140.0)  # noqa: E731
+    things = [(crate, lambda t: 90.0, GREY), (leg, step, RED), (small_body, lambda t: 60 + 3.0 * t, RED)]
+    frames, (still, standing, trunk) = scene(31, things, camera=lambda t: 0.5 * t)
+    motion = SharedMotion(dense_flow(frames))
+    bodies = {t: standing[t] | trunk[t] for t in (0, 5, 10, 20, 30)}
+    gone = motion.gone(5, standing[5] | still[5], frames, bodies)
+    assert gone[standing[5]].mean() > 0.9
+    assert gone[still[5]].mean() < 0.1
+    # Nothing is known of what no other frame shows the place of.
+    assert not motion.gone(5, standing[5], frames, {5: bodies[5]}).any()
+    assert not motion.gone(5, standing[5], frames, {t: np.ones_like(bodies[5]) for t in bodies}).any()
+
+
 def test_a_little_motion_is_enough_before_a_camera_that_stands_still():
     things = [(post, lambda t: 150.0, GREY), (body, lambda t: 60 + 0.25 * t, RED)]
     frames, (still, animal) = scene(12, things)

@@ -59,6 +59,16 @@ def test_a_gap_allows_a_turn():
     assert apart(path, truth).max() < np.radians(5)
 
 
+def test_who_spins_is_followed_and_frames_that_jump_are_no_spin():
+    """Three turns in four seconds, with a fifth of the frames mirrored; and a body at rest with as many."""
+    rng = np.random.default_rng(0)
+    t = np.arange(120) / 30
+    mirrored = rng.random(120) < 0.2
+    for truth in (np.radians(270) * t, np.full(120, 0.5)):
+        _, path = view_over_clip(bump(np.where(mirrored, np.pi - truth, truth)), t=t)
+        assert np.quantile(apart(path, truth), 0.9) < np.radians(25)
+
+
 def test_one_frame_is_a_clip_too():
     marginal, path = view_over_clip(bump(np.array([1.0])), t=np.zeros(1))
     assert marginal.shape == (1, BINS)

@@ -22,7 +22,7 @@ from slomo.stage import Artifact, Inputs, Progress
 
 Array = np.ndarray
 
-VERSION = 9
+VERSION = 10
 MOST_FRAMES = 600  # that are looked at: each takes 3 MB, and long clips are not to take more than others
 
 PRIORS = ("auto", "none")

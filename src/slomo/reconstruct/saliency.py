@@ -96,8 +96,9 @@ class SaliencySegmenter:
             found = {t: component_at(b & ~motion.apart(t, frames, found, rest)) for t, b in found.items()}
             for t, body in found.items():
                 calm = foreign(body, body, motion.share(t, motion.velocity(t, body)))
-                # What it passes it leaves behind, or it stands out no more: its own legs stay with it.
+                # What it passes it leaves behind, or it stands out no more: its own legs stay with it, or come along.
                 left = calm & ~motion.lasting(t, calm, found)
+                left &= ~motion.gone(t, left, frames, found)
                 bodies[t] = component_at(body & ~(left & wider_than_a_leg(left, body)))
             speed = {t: min(float(np.linalg.norm(motion.velocity(t, b))), _FAST) for t, b in bodies.items()}
             alive = np.median([motion.liveliness(t, b) for t, b in bodies.items()]) > 1

@@ -11,7 +11,7 @@ import numpy as np
 from slomo.errors import InvalidData, UsageError
 from slomo.stage import Artifact, Inputs, Progress
 
-MASKS_VERSION = 25
+MASKS_VERSION = 26
 CAMERA_VERSION = 9
 QUALITIES = ("draft", "normal", "high")
 
