@@ -360,7 +360,11 @@ def test_a_leg_that_stood_comes_along_and_what_is_passed_is_left_behind():
         return (abs(x) < 12) & (y > 75) & (y < 105)
 
     step = lambda t: 60.0 if t < 10 else min(60.0 + 8 * (t - 10), 140.0)  # noqa: E731
-    things = [(crate, lambda t: 90.0, GREY), (leg, step, RED), (small_body, lambda t: 60 + 3.0 * t, RED)]
+
+    def trunk_of(x, y):
+        return (x / 32) ** 2 + ((y - 50) / 20) ** 2 < 1
+
+    things = [(crate, lambda t: 90.0, GREY), (leg, step, RED), (trunk_of, lambda t: 60 + 3.0 * t, RED)]
     frames, (still, standing, trunk) = scene(31, things, camera=lambda t: 0.5 * t)
     motion = SharedMotion(dense_flow(frames))
     bodies = {t: standing[t] | trunk[t] for t in (0, 5, 10, 20, 30)}

@@ -118,7 +118,7 @@ def test_a_slow_source_is_not_thinned_below_what_a_stride_needs():
     assert fit_in(25 * 600, 25.0, (1280, 720), 640, 1.0, 300.0)[0] == 2
     assert fit_in(20 * 600, 20.0, (1280, 720), 640, 1.0, 300.0)[0] == 1
     assert fit_in(100, 30.0, (320, 240), 640, 1.0, 300.0) == (1, 320, 100)
-    assert fit_in(17, 30.0, (3840, 2160), 640, 1.0, 1.0)[::2] == (2, 9)  # a third of them would be too few for a fit
+    assert fit_in(17, 60.0, (3840, 2160), 640, 1.0, 1.0)[::2] == (2, 9)  # a third of them would be too few for a fit
 
 
 def test_long_clip_is_thinned_and_said(tmp_path):

@@ -9,8 +9,9 @@ from slomo.prior.labels import BINS
 Array = np.ndarray
 
 TURN = np.radians(70.0)  # rad/s, a subject that turns faster is unlikely, the more so the faster
-SPINS = np.radians([120.0, 200.0, 280.0, 360.0])  # rad/s, of one that spins one way all the time, which few do
+SPINS = np.radians([120.0, 200.0, 280.0, 360.0])  # rad/s, of one that goes on turning one way, which few do
 SPREAD = np.radians(120.0)  # rad/s, by about which it does not
+_STEP = np.radians(40.0)  # of a spin from one frame to the next, at most
 _FEW = 5.0  # nats by which what is seen must be likelier if it spins
 CORRELATION = 0.2  # s: pictures as close as that look alike, and so do the errors; they count as one
 _LEAK = 1e-7  # probability of any jump at all: a cut, or a subject that was lost for a moment
@@ -31,8 +32,11 @@ def view_over_clip(*said: Array, t: Array) -> tuple[Array, Array]:
     """
     log_p = sum(np.log(np.maximum(p, 1e-6)) for p in said) * independent(t)[:, None]
     slow = _decided(log_p, t, 0.0, TURN)
-    spinning = max((_decided(log_p, t, spin, SPREAD) for spin in (*SPINS, *-SPINS)), key=lambda found: found[2])
-    marginal, path, _ = spinning if spinning[2] - _FEW > slow[2] else slow
+    # Between frames far apart a spin is half a turn, which is what a mirror image looks like.
+    near = SPINS[SPINS * np.median(np.diff(t)) < _STEP] if len(t) > 1 else SPINS[:0]
+    spinning = [_decided(log_p, t, spin, SPREAD) for spin in (*near, *-near)]
+    best = max(spinning, key=lambda found: found[2], default=slow)
+    marginal, path, _ = best if best[2] - _FEW > slow[2] else slow
 
     offset = np.arange(-_NEAR, _NEAR + 1)
     near = np.take_along_axis(marginal, (path[:, None] + offset) % BINS, 1)

@@ -56,8 +56,9 @@ def fit(
     if run is None:
         run = starts.start(problem, root, generator)
     while run.phase < len(PHASES):
-        schedule, total = effort.schedules[run.phase], _total_cost(effort, run.phase)
-        done = sum(s.iterations * _cost(s) for s in effort.schedules[: run.phase])
+        schedule = effort.schedules[run.phase]
+        done = sum(_work(s) for name, s in zip(PHASES, effort.schedules, strict=True) if name in run.log)
+        total = max(_usual(effort), done + _work(schedule))
 
         def each(
             i: int, optimiser: torch.optim.Adam, loss: Tensor, run=run, schedule=schedule, done=done, total=total
@@ -103,9 +104,13 @@ def _cost(schedule: Schedule) -> float:
     return schedule.frames * schedule.pixels + 2000
 
 
-def _total_cost(effort: Effort, phase: int) -> float:
-    """Of what is known to come in a `phase`: most clips end with the limbs."""
-    return sum(s.iterations * _cost(s) for s in effort.schedules[: max(phase, LIMBS) + 1])
+def _work(schedule: Schedule) -> float:
+    return schedule.iterations * _cost(schedule)
+
+
+def _usual(effort: Effort) -> float:
+    """The work of all phases that every clip has."""
+    return sum(_work(s) for s in effort.schedules[: LIMBS + 1])
 
 
 def _to_gait(
@@ -119,7 +124,7 @@ def _to_gait(
 ) -> Run:
     """The best few of the gaits over the best headings."""
     first = effort.schedules[0]
-    done = first.iterations * _cost(first) / _total_cost(effort, run.phase)
+    done = _work(first) / _usual(effort)
     return gaits.tried(
         problem, run, losses, root, candidates=effort.candidates, phases=effort.phases_of_gait, metres=metres,
         trying=lambda what: progress.update(done, what),
@@ -193,7 +198,7 @@ def _either_way(problem: Problem, root: RootGuess) -> bool:
 
 
 def _long_enough(effort: Effort, problem: Problem, root: RootGuess) -> Effort:
-    """The last phase is as long as the one before for who may be turned around: a third of it says little of that."""
+    """The phase limbs is as long as the one before for who may be turned around: a third of it says little of that."""
     schedules = list(effort.schedules)
     if not (_either_way(problem, root) and schedules[LIMBS].iterations):
         return effort
@@ -203,7 +208,7 @@ def _long_enough(effort: Effort, problem: Problem, root: RootGuess) -> Effort:
 
 def _front_or_back(run: Run) -> bool:
     """Whether a person is compared with one who is turned around: there the picture tells little."""
-    return any("seen" in label for label in run.labels)
+    return len({label.get("seen") for label in run.labels}) > 1
 
 
 def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, *_) -> Run:

@@ -9,7 +9,7 @@ import numpy as np
 from slomo.reconstruct.flow import Flow, inside, sample
 from slomo.reconstruct.instances import components
 from slomo.reconstruct.motion_segment import residual_motion
-from slomo.reconstruct.segment import grown
+from slomo.reconstruct.segment import box_of, grown
 
 _SIDE = 256  # px, longer side at which motion is looked at
 _GAP = 4  # frames over which it is taken, either way
@@ -20,6 +20,7 @@ _ASTRAY = 1.5  # px, median motion of the whole picture, from which on the homog
 _BENDS = 1.5  # px of motion that no flat thing has, from which on a body is said to be alive
 _CALM = 0.3, 0.45  # px as a whole and of bending, likewise before a camera that stands still, where things have 0.06
 ALIKE = 10.0  # levels of RGB, between two frames of a thing that is still the same
+_LEG, _LOW = 0.25, 0.2  # of the body's area a leg at most; of its height, within which it ends above the lowest row
 _BESIDE = 2  # frames of several, either way, in which is looked for what a body leaves behind
 _KEPT = 64  # frames whose motion is remembered
 _STILL = 0.3  # px of the median motion, below which the camera stands still and nothing has parallax
@@ -106,7 +107,8 @@ class SharedMotion:
     def gone(self, t: int, patch: np.ndarray, frames: np.ndarray, bodies: Mapping[int, np.ndarray]) -> np.ndarray:
         """(H, W) bool, what of a patch (H, W) in frame t is not left behind when the body (H, W) bool has moved on: the
         foot and the leg on which it stood. Where flow leads, and where the ground goes, the frames of `bodies` around
-        show something else there. Pieces of which most is covered or out of the picture in all of them are not gone."""
+        show something else there. Pieces of which most is covered or out of the picture in all of them are not gone.
+        Nor is what cannot be a leg, large or high up: a companion who walks away."""
         small = lambda m: cv2.resize(m.astype(np.float32), self.size, interpolation=cv2.INTER_AREA)  # noqa: E731
         out, at = np.zeros_like(patch), sorted(bodies)
         if not patch.any():
@@ -120,7 +122,11 @@ class SharedMotion:
                 clear = inside(offset) & (sample(body, offset) < 0.2)
                 free |= clear
                 again |= clear & (np.abs(sample(there, offset) - here).mean(-1) < ALIKE)
+        _, top, _, bottom = box_of(bodies[t])
+        low = bottom - _LOW * (bottom - top)
         for piece in components(patch, 1):
+            if piece.sum() > _LEG * bodies[t].sum() or box_of(piece)[3] < low:
+                continue
             seen = small(piece) > 0.5
             if (free & seen).sum() > 0.5 * seen.sum() and (again & seen).sum() < 0.5 * (free & seen).sum():
                 out |= piece

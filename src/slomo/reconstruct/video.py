@@ -115,8 +115,8 @@ def decode(
 def fit_in(
     frames: int, rate: float, size: tuple[float, float], max_side: int, enlarge: float, megapixels: float
 ) -> tuple[int, float, int]:
-    """What is taken of a clip. A small one is enlarged as far as that fits in. Of a long one every n-th frame, no fewer
-    than `LEAST_FPS` a second; then smaller frames, no smaller than `LEAST_SIDE`; the end is left out if need be.
+    """What is taken of a clip. A small one is enlarged as far as that fits in. Of a long one every n-th frame, at least
+    `LEAST_FPS` a second and `MIN_FRAMES`; then smaller frames, at least `LEAST_SIDE`; the end is left out if need be.
 
     Args:
         frames: wanted, `rate` of them a second.  size: px, of the source, width and height.
