@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slomo.prior import sides
+from slomo.prior import clip, sides
 from slomo.prior.clip import CENTRES, up_over_clip, view_over_clip
 from slomo.prior.evidence import Shots, from_network
 from slomo.prior.frames import Motion, every
@@ -67,6 +67,17 @@ def test_who_spins_is_followed_and_frames_that_jump_are_no_spin():
     for truth in (np.radians(270) * t, np.full(120, 0.5)):
         _, path = view_over_clip(bump(np.where(mirrored, np.pi - truth, truth)), t=t)
         assert np.quantile(apart(path, truth), 0.9) < np.radians(25)
+
+
+def test_mirrored_frames_far_apart_are_no_spin(monkeypatch):
+    """Half a turn from one frame to the next is what a mirror image looks like."""
+    rng = np.random.default_rng(0)
+    t = 0.35 * np.arange(600)
+    azimuth = 0.2 * rng.standard_normal(600)
+    said = bump(np.where(rng.random(600) < 0.3, np.pi - azimuth, azimuth))
+    _, path = view_over_clip(said, t=t)
+    monkeypatch.setattr(clip, "SPINS", np.zeros(0))
+    np.testing.assert_array_equal(path, view_over_clip(said, t=t)[1])
 
 
 def test_one_frame_is_a_clip_too():
