@@ -33,8 +33,8 @@ def view_over_clip(*said: Array, t: Array) -> tuple[Array, Array]:
     log_p = sum(np.log(np.maximum(p, 1e-6)) for p in said) * independent(t)[:, None]
     slow = _decided(log_p, t, 0.0, TURN)
     # Between frames far apart a spin is half a turn, which is what a mirror image looks like.
-    near = SPINS[SPINS * np.median(np.diff(t)) < _STEP] if len(t) > 1 else SPINS[:0]
-    spinning = [_decided(log_p, t, spin, SPREAD) for spin in (*near, *-near)]
+    spins = SPINS[SPINS * np.median(np.diff(t)) < _STEP] if len(t) > 1 else SPINS[:0]
+    spinning = [_decided(log_p, t, spin, SPREAD) for spin in (*spins, *-spins)]
     best = max(spinning, key=lambda found: found[2], default=slow)
     marginal, path, _ = best if best[2] - _FEW > slow[2] else slow
 
