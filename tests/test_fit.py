@@ -200,13 +200,11 @@ def test_an_interrupted_fit_resumes_to_the_same_bits(walk, monkeypatch, saves: i
     assert tuple(name for name in ("alike", "overtaking") if name in search) == more
     for name in more:
         assert [name in entry for entry in search[name]].count(True) == 1
-    last, by = (
-        (search["overtaking"], "picture") if "overtaking" in more else (search[more[-1] if more else "limbs"], "loss")
-    )
-    hypothesis = whole.json["report.json"]["hypothesis"]
+    name = more[-1] if more else "limbs"
+    last, hypothesis = search[name], whole.json["report.json"]["hypothesis"]
     assert {k: v for k, v in last[0].items() if k not in ("loss", "picture")} == hypothesis
-    if by == "picture":
-        assert last == sorted(last, key=lambda e: e[by])
+    if name != "alike":  # there the loss may be higher by a little
+        assert last == sorted(last, key=lambda e: e["picture" if name == "overtaking" else "loss"])
 
 
 def test_without_time_for_them_no_limbs_are_moved(walk):

@@ -252,15 +252,15 @@ def _effort(config: FitConfig) -> fitting.Effort:
     heading, gait, rivals, final, limbs = config.iterations or ITERATIONS[config.quality]
     skeleton = tuple(f"shape.{k}" for k in ("log_length", "group", "node", "shift", "radius", "girth"))
     last = Schedule(final, 48, 300, (*skeleton, "Q", "G", "tilt"), late=("shape.flesh",))
-    more = Schedule(limbs, 48, 300, (*skeleton, "shape.flesh", "Q", "G", "tilt"), rate=AGAIN)
+    again = Schedule(limbs, 48, 300, (*skeleton, "shape.flesh", "Q", "G", "tilt"), rate=AGAIN)
     return fitting.Effort(
         schedules=(
             Schedule(heading, 12, 160, ("G", "shape.log_length", "shape.group", "shape.girth")),
             Schedule(gait, 16, 160, (*skeleton, "Q", "G", "tilt"), stance=1.0),
             Schedule(rivals, 32, 200, (*skeleton, "Q", "G", "tilt"), stance=0.0),
             last,
-            more,
-            more,
+            again,
+            again,
             last if limbs else replace(last, iterations=0),
         ),
         candidates=config.candidates,
