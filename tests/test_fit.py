@@ -126,9 +126,22 @@ def test_one_candidate_leaves_all_gaits_out(walk, monkeypatch, same, headings):
     assert all(entry["gait"] == "none" for entry in tried)
 
 
+class _Watched(Silent):
+    """Remembers how far the work is said to be."""
+
+    def __init__(self):
+        self.done = []
+
+    def update(self, fraction: float, message: str = "") -> None:
+        self.done.append(fraction)
+
+
 def test_a_walk_is_found(walk):
     true, masks, flow = walk
-    out = reconstruct(_inputs(masks, flow), QUICK, Silent())
+    watched = _Watched()
+    out = reconstruct(_inputs(masks, flow), QUICK, watched)
+    assert watched.done == sorted(watched.done)
+    assert 0 < watched.done[-1] <= 1
     assert out.failure is None
     report = out.json["report.json"]
     assert report["hypothesis"]["gait"] == "walk"

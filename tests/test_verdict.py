@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 
-from slomo.reconstruct.outcome import _swap_margin
+from slomo.reconstruct.outcome import _swap_margin, lowest
 from slomo.reconstruct.verdict import Check, Facts, checks, floating, verdict
 
 GOOD = Facts(
-    report=dict(silhouette_iou=0.85, flow_residual_px=0.4, swap_margin=0.05, foot_skate_mps=0.01),
+    report=dict(
+        silhouette_iou=0.85, silhouette_iou_low=0.8, silhouette_low_s=1.2, flow_residual_px=0.4, swap_margin=0.05,
+        foot_skate_mps=0.01,
+    ),
     masks=dict(quality_mean=0.9, frames_without_subject=0),
     camera=dict(reprojection_error_px=0.3, gravity_std_deg=1.0),
     feet=np.full((30, 4, 3), 0.02), sole=0.02, t=np.arange(30) / 15, length=0.5, stretch=np.ones(10),
@@ -30,6 +33,7 @@ def test_nothing_speaks_against_a_good_one():
     [
         (dict(report=dict(swap_margin=0.002)), "fair", "swap_margin"),
         (dict(report=dict(silhouette_iou=0.3)), "unusable", "silhouette_iou"),
+        (dict(report=dict(silhouette_iou_low=0.7)), "fair", "silhouette_iou_low"),
         (dict(masks=dict(frames_without_subject=25)), "unusable", "frames_without_subject"),
         (dict(camera=dict(reprojection_error_px=9.0)), "fair", "camera_error_px"),
         (dict(feet=np.full((30, 4, 3), -0.1)), "poor or worse", "penetration"),
@@ -64,6 +68,23 @@ def test_the_opposite_of_legs_on_their_own_has_them_exchanged():
     rivals += [own | {"legs": "exchanged", "loss": 1.2}]
     log = {"rivals": rivals, "final": [own | {"loss": 0.7}], "limbs": [own | {"loss": 0.6}]}
     assert _swap_margin(log) == pytest.approx(0.5)
+
+
+def test_the_lowest_overlap_is_that_of_a_while_and_not_of_one_frame():
+    t = np.arange(60) / 30
+    iou = np.full(60, 0.9)
+    iou[10] = 0.3  # by itself .6 away from the others, spread over nine frames less than what follows
+    iou[30:39] = 0.7
+    iou[40:45] = np.nan
+    low, at = lowest(iou, t)
+    assert low == pytest.approx(0.7)
+    assert at == pytest.approx(34 / 30)
+
+
+def test_the_lowest_overlap_of_a_short_clip_is_that_of_all_its_frames():
+    low, at = lowest(np.array([0.8, 0.6, np.nan, 0.7]), np.arange(4) / 30)
+    assert low == pytest.approx(0.7)
+    assert at == pytest.approx(4 / 90)
 
 
 def test_limits_are_inclusive():

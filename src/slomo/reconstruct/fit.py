@@ -58,7 +58,7 @@ def fit(
     while run.phase < len(PHASES):
         schedule = effort.schedules[run.phase]
         done = sum(_work(s) for name, s in zip(PHASES, effort.schedules, strict=True) if name in run.log)
-        total = max(_usual(effort), done + _work(schedule))
+        total = max(_expected(effort, root), done + _work(schedule))
 
         def each(
             i: int, optimiser: torch.optim.Adam, loss: Tensor, run=run, schedule=schedule, done=done, total=total
@@ -108,9 +108,9 @@ def _work(schedule: Schedule) -> float:
     return schedule.iterations * _cost(schedule)
 
 
-def _usual(effort: Effort) -> float:
-    """The work of all phases that every clip has."""
-    return sum(_work(s) for s in effort.schedules[: LIMBS + 1])
+def _expected(effort: Effort, root: RootGuess) -> float:
+    """The work of all phases that the clip may have: where some are skipped, progress leaps ahead, and never back."""
+    return sum(_work(s) for s in (effort.schedules if root.travelled > 1 else effort.schedules[: LIMBS + 1]))
 
 
 def _to_gait(
@@ -124,7 +124,7 @@ def _to_gait(
 ) -> Run:
     """The best few of the gaits over the best headings."""
     first = effort.schedules[0]
-    done = _work(first) / _usual(effort)
+    done = _work(first) / _expected(effort, root)
     return gaits.tried(
         problem, run, losses, root, candidates=effort.candidates, phases=effort.phases_of_gait, metres=metres,
         trying=lambda what: progress.update(done, what),

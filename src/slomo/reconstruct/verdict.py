@@ -69,6 +69,7 @@ class Facts:
 def checks(f: Facts) -> list[Check]:
     """All checks, in the order of the stages that they are about."""
     look = "look at the masks; choose the subject with --subject-at, or give your own with --masks"
+    limb = f"look at {f.report['silhouette_low_s']:.1f} s: some limb is not where it is seen"
     frames = max(len(f.t), 1)
     height = (f.feet[..., 2] - f.sole) / f.length
     return [
@@ -78,6 +79,7 @@ def checks(f: Facts) -> list[Check]:
         Check("gravity_std_deg", f.camera.get("gravity_std_deg"), 4.0, None, "film more of the ground"),
         # The rest pose at the right place overlaps by 0.5 to 0.6, a fit that is right by 0.75 and more.
         Check("silhouette_iou", f.report["silhouette_iou"], 0.72, 0.45, look, least=True),
+        Check("silhouette_iou_low", f.report["silhouette_iou_low"], 0.75, None, limb, least=True),
         Check("flow_residual_px", f.report["flow_residual_px"], 2.0, None, "motion blur, or another body"),
         Check("swap_margin", f.report["swap_margin"], 0.01, None, "left and right legs may be swapped", least=True),
         Check("foot_skate", f.report["foot_skate_mps"] / f.length, 0.35, 2.5, "standing feet slide: the camera is off"),
