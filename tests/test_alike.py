@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from slomo.reconstruct import alike, fit, hypotheses
+from slomo.reconstruct import alike, fit, hypotheses, preferences
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.problem import Schedule, rank
 from slomo.reconstruct.run import Run
@@ -80,9 +80,25 @@ def test_once_the_limbs_are_fitted_strides_are_borrowed_again(monkeypatch):
     hasty = replace(effort, schedules=tuple(replace(s, iterations=0) for s in effort.schedules))
     for alone in (after_limbs(range(4)), after_limbs([0, 1, 3], hasty)):
         assert (alone.phase, alone.labels) == (len(fit.PHASES), [label])
-    # Of strides that the picture does not tell apart the alike ones win.
-    near = fit._alike(beside, torch.tensor([1.0, 1.005]))
+
+
+def test_of_strides_that_the_picture_does_not_tell_apart_the_alike_ones_win():
+    first = {"gait": "walk", "limbs": "on their own"}
+    near = preferences.alike([first, first | {"alike": "again"}], torch.tensor([1.0, 1.005]), "alike")
     assert near[1] < near[0]
+    far = preferences.alike([first, first | {"alike": "again"}], torch.tensor([1.0, 1.015]), "alike")
+    assert far[0] < far[1]
+
+
+def test_alike_strides_say_nothing_against_exchanged_legs():
+    """Who has its legs exchanged wins by a lower loss than all others have, whichever strides those do."""
+    first = {"gait": "walk"}
+    labels = [first, first | {"limbs": "on their own", "strides": "alike"}, first | {"exchanged": "hind"}]
+    order = lambda *losses: preferences.alike(labels, torch.tensor(losses), "strides").argsort().tolist()  # noqa: E731
+    assert order(1.0, 1.001, 0.995) == [2, 1, 0]
+    assert order(0.996, 1.001, 0.999) == [1, 2, 0]
+    assert order(0.98, 1.001, 0.999) == [0, 1, 2]
+    assert order(1.0, 0.99, 0.995) == [1, 2, 0]
 
 
 def test_without_two_strides_nothing_is_borrowed():

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from slomo.reconstruct import alike, gaits, hypotheses, limb_track, sides, starts
+from slomo.reconstruct import alike, gaits, hypotheses, limb_track, preferences, sides, starts
 from slomo.reconstruct.hypotheses import RootGuess
 from slomo.reconstruct.overtaking import overtaking
 from slomo.reconstruct.problem import Problem, Schedule, Variables, optimise, pick, rank
@@ -22,12 +22,11 @@ Tensor = torch.Tensor
 
 TIE = 0.03  # a rival whose loss is higher by this share may still win in the end
 TURNED = 0.1  # the same of one that faces the other way: short fits say little of that
-STEPS = 0.04  # share by which the loss without a gait must be lower over more than a body length
-ALIKE = 0.01  # share by which the loss with strides that are alike may be higher
 ELSEWHERE = 0.1  # body lengths between the feet of two hypotheses that move their legs otherwise, on average
 _MOTION = ("gait", "legs", "seen")
 PHASES = ("heading", "gait", "rivals", "final", "limbs", "alike", "overtaking")
 LIMBS = PHASES.index("limbs")  # the last phase that all clips have
+_ALIKE = {LIMBS: "strides", PHASES.index("alike"): "alike"}  # what labels say of those whose strides are alike
 BEFORE = "before."  # prefix of the variables of the best one before a phase that comes after the limbs
 FINAL = PHASES.index("final")  # from there on little is between two hypotheses, and many draws tell them apart
 
@@ -160,7 +159,7 @@ def _to_final(problem: Problem, run: Run, losses: Tensor, root: RootGuess, *_) -
     """The best one goes on, and with it the best that moves its legs otherwise if it is as good but for `TIE`: by what
     it was made of, or by where its feet are (one gait half a stride later is its left-right opposite). A person who is
     turned around may be worse by more (`TURNED`)."""
-    losses = _stepping(run, losses, root)
+    losses = preferences.steps(run.labels, losses, root)
     order = losses.argsort().tolist()
     own = run.labels[order[0]]
     feet = sides.feet(problem, run.x, run.guess)
@@ -169,19 +168,6 @@ def _to_final(problem: Problem, run: Run, losses: Tensor, root: RootGuess, *_) -
     limit = {k: TIE if run.labels[k].get("seen") == own.get("seen") else TURNED for k in other}
     which = torch.tensor(order[:1] + [k for k in other if losses[k] < (1 + limit[k]) * losses[order[0]]][:1])
     return Run(3, pick(run.x, which), run.guess.pick(which), [run.labels[int(k)] for k in which], run.log)
-
-
-def _stepping(run: Run, losses: Tensor, root: RootGuess) -> Tensor:
-    """(H,) losses to compare by. Somebody who travels takes steps: legs without a gait must look better by `STEPS`."""
-    if root.travelled <= 1:
-        return losses
-    return losses * torch.tensor([1 + STEPS * (label["gait"] == "none") for label in run.labels])
-
-
-def _alike(run: Run, losses: Tensor) -> Tensor:
-    """(H,) losses to compare by. Where the picture leaves it open strides are alike."""
-    key = "strides" if run.phase == LIMBS else "alike"
-    return losses * torch.tensor([1 - ALIKE * (key in label) for label in run.labels])
 
 
 def _by_picture(problem: Problem, run: Run) -> Tensor:
@@ -215,7 +201,7 @@ def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effor
     """The best one goes on, beside it with limbs that are where they are seen better by now, where any are and there is
     time for it, and with a pair of legs exchanged where that is hardly worse; of a person who stays in place turned
     around once more, and with limbs kept apart that change places."""
-    best = _winner(run, _stepping(run, losses, root))
+    best = _winner(run, preferences.steps(run.labels, losses, root))
     rivals = [(best.x, best.guess)]
     labels = list(best.labels)
     if effort.schedules[LIMBS].iterations:
@@ -250,7 +236,7 @@ def _borrowed(
 
 def _to_alike(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, *_) -> Run:
     """The best one goes on beside itself with alike strides, which show more of it once the limbs have been fitted."""
-    best = _winner(run, _alike(run, losses))
+    best = _winner(run, preferences.alike(run.labels, losses, _ALIKE[run.phase]))
     found = None
     if effort.schedules[PHASES.index("alike")].iterations:
         found = _borrowed(problem, best, best.labels[0], (best.x, best.guess), root)
@@ -260,7 +246,9 @@ def _to_alike(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effor
 
 
 def _to_overtaking(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, *_) -> Run:
-    return _overtaking(problem, _as_it_was(_winner(run, _alike(run, losses))), root, effort)
+    return _overtaking(
+        problem, _as_it_was(_winner(run, preferences.alike(run.labels, losses, _ALIKE[run.phase]))), root, effort
+    )
 
 
 def _overtaking(problem: Problem, best: Run, root: RootGuess, effort: Effort) -> Run:
