@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from slomo.packed import pack
 from slomo.reconstruct import decode_stage
 from slomo.reconstruct.flow import dense_flow
-from slomo.reconstruct.stage import pack
 from slomo.reconstruct.subject_flow import closer, merged
 from slomo.reconstruct.video import decode
 

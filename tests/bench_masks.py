@@ -16,8 +16,9 @@ from scipy.stats import spearmanr
 
 from mask_cases import CASES, make_case
 from slomo.errors import SlomoError
+from slomo.packed import unpack
 from slomo.reconstruct import decode_stage
-from slomo.reconstruct.stage import MasksConfig, run_masks, unpack
+from slomo.reconstruct.stage import MasksConfig, run_masks
 from slomo.stage import Artifact, Inputs, Silent
 
 ROOT = Path(__file__).parents[1]

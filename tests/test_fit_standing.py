@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from slomo.reconstruct import standing
-from slomo.reconstruct.kinematics import Kinematics
+from slomo.reconstruct.kinematics import Kinematics, limb_links
 from slomo.skeleton import list_skeletons, load_skeleton
 
 T = np.arange(60) / 30
@@ -98,7 +98,7 @@ def test_legs_reach_what_they_can_with_bones_as_they_are(name: str):
     bent = standing.stand(kin, shape, place, R, q, target)
     after = kin.pose(shape, place, R, bent).nodes[0]
     assert np.abs(after[:, kin.contacts].numpy() - target).max() < 0.004 * length
-    legs = sorted({j for limb in kin.skeleton.limbs for j in standing._chain(kin, limb.swing, limb.contact)})
+    legs = sorted({j for limb in kin.skeleton.limbs for j in limb_links(kin.skeleton, limb)})
     same = [j for j in range(kin.B) if j not in legs]
     torch.testing.assert_close(bent[:, :, same], q[:, :, same])
     assert float((bent - q).abs().max()) < 0.5

@@ -3,10 +3,10 @@
 import cv2
 import numpy as np
 
+from slomo.packed import pack
 from slomo.reconstruct import subject_flow
 from slomo.reconstruct.flow import dense_flow
 from slomo.reconstruct.segment import blend_over_time
-from slomo.reconstruct.stage import pack
 from test_masks import iou, moving_disc, noise
 
 

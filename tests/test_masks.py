@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from slomo.errors import InvalidData, UsageError
+from slomo.packed import pack, unpack
 from slomo.reconstruct import decode_stage
 from slomo.reconstruct.flow import dense_flow
 from slomo.reconstruct.instances_motion import SharedMotion
 from slomo.reconstruct.motion_segment import border_distance
 from slomo.reconstruct.passing import give_back_what_passes
 from slomo.reconstruct.segment import component_at, frame_certainty, frame_quality, spans
-from slomo.reconstruct.stage import MasksConfig, pack, run_masks, unpack
+from slomo.reconstruct.stage import MasksConfig, run_masks
 from slomo.reconstruct.surroundings import _staying, give_back_patches, give_back_surroundings
 from slomo.reconstruct.votes import vote_over_time
 from slomo.stage import Artifact, Inputs, Silent

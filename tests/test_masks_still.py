@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 
 from slomo.errors import InvalidData
+from slomo.packed import unpack
 from slomo.reconstruct.background import SHADOW
 from slomo.reconstruct.flow import dense_flow
 from slomo.reconstruct.instances import Choice
 from slomo.reconstruct.segment import Masks
-from slomo.reconstruct.stage import MasksConfig, _segmented, run_masks, unpack
+from slomo.reconstruct.stage import MasksConfig, _segmented, run_masks
 from slomo.reconstruct.still_segment import StillSegmenter, _darkest_shade, _trimmed
 from slomo.stage import Silent
 from test_masks import inputs, iou, moving_disc

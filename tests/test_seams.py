@@ -8,7 +8,7 @@ import torch
 
 from slomo.reconstruct import hypotheses, seams
 from slomo.reconstruct.hypotheses import GaitHypothesis, RootGuess
-from slomo.reconstruct.kinematics import Kinematics
+from slomo.reconstruct.kinematics import Kinematics, limb_links
 from slomo.reconstruct.run import Run
 from slomo.reconstruct.trajectory import Guess, Trajectory
 from slomo.skeleton import load_skeleton
@@ -17,7 +17,7 @@ KIN = Kinematics(load_skeleton("quadruped"))
 FPS, T = 15, 75
 WHERE = [(0, 45), (30, T)]  # frames of the two chunks
 HIND = torch.tensor([k for limb in KIN.skeleton.limbs if "hind" in limb.name
-                     for k in hypotheses.limb_links(KIN.skeleton, limb)])  # fmt: skip
+                     for k in limb_links(KIN.skeleton, limb)])  # fmt: skip
 
 
 def motion() -> Guess:

@@ -7,6 +7,7 @@ import numpy as np
 
 from slomo.errors import InvalidData, UsageError
 from slomo.ground_path import ground_path, mask_box
+from slomo.packed import unpack
 from slomo.pinhole import Intrinsics
 from slomo.prior.crop import crop_box
 from slomo.prior.evidence import GRID, Columns, Dense, Shots, from_model, from_network, from_user
@@ -174,7 +175,7 @@ def _shots(inputs: Inputs, fps: float) -> Shots:
     decode, masks = inputs.artifacts["decode"].npz["frames.npz"], inputs.artifacts["masks"].npz
     packed = masks["masks.npz"]
     t = np.asarray(decode["t"], float)
-    full = np.unpackbits(packed["packed"], axis=-1)[..., : int(packed["shape"][2])].astype(bool)
+    full = unpack(packed)
     index = np.arange(0, len(t), max(every(t, fps), -(-len(t) // MOST_FRAMES)))
     index = index[full[index].any((1, 2))]
     return Shots(

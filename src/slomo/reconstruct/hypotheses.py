@@ -10,12 +10,12 @@ import torch
 
 from slomo.ground_path import ground_path
 from slomo.reconstruct.evidence import Evidence
-from slomo.reconstruct.kinematics import Kinematics, yaw_pitch_roll
+from slomo.reconstruct.kinematics import Kinematics, limb_links, yaw_pitch_roll
 from slomo.reconstruct.observations import Observations
 from slomo.reconstruct.problem import Problem, Variables
 from slomo.reconstruct.stride import Steps
 from slomo.reconstruct.trajectory import Guess
-from slomo.skeleton import Gait, Limb, Skeleton
+from slomo.skeleton import Gait, Skeleton
 
 Array = np.ndarray
 Tensor = torch.Tensor
@@ -150,16 +150,6 @@ def turned_around(problem: Problem, x: Variables, guess: Guess) -> tuple[Variabl
     yaw = 2 * torch.atan2(away[..., 1], away[..., 0]) + math.pi - yaw
     lean = torch.stack([pitch, -roll], -1)
     return _silent(x, "G"), replace(guess, position=position, yaw=yaw, lean=lean, q=problem.kin.mirrored(q))
-
-
-def limb_links(skeleton: Skeleton, limb: Limb) -> list[int]:
-    """The limb's links, from the one that its swing joint moves outwards."""
-    out = []
-    node, trunk = int(skeleton.link[limb.contact]), int(skeleton.link[limb.swing])
-    while node != trunk and node > 0:
-        out.append(node)
-        node = int(skeleton.link[node])
-    return out[::-1]
 
 
 def leg_pairs(kin: Kinematics) -> list[tuple[str, Tensor, tuple[int, int]]]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from slomo.skeleton import Skeleton
+from slomo.skeleton import Limb, Skeleton
 
 Tensor = torch.Tensor
 
@@ -199,3 +199,13 @@ class Kinematics:
         ends = body.nodes[:, :, self.link[self.contacts]]
         apart = ((ends[:, :, left] - ends[:, :, right]) * R_root[:, :, None, :, 1]).sum(-1)
         return (-apart).clamp(min=0) / body.length[:, None, None]
+
+
+def limb_links(skeleton: Skeleton, limb: Limb) -> list[int]:
+    """The limb's links, from the one that its swing joint moves outwards."""
+    out = []
+    node, trunk = int(skeleton.link[limb.contact]), int(skeleton.link[limb.swing])
+    while node != trunk and node > 0:
+        out.append(node)
+        node = int(skeleton.link[node])
+    return out[::-1]

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 
 from slomo.reconstruct import evidence_terms, losses
-from slomo.reconstruct.hypotheses import as_guess, limb_links
+from slomo.reconstruct.hypotheses import as_guess
+from slomo.reconstruct.kinematics import limb_links
 from slomo.reconstruct.pose_track import smooth, viterbi
 from slomo.reconstruct.problem import Problem, Variables
 from slomo.reconstruct.trajectory import Guess

@@ -13,6 +13,7 @@ import torch
 
 from slomo.errors import InvalidData
 from slomo.ground_path import mask_box
+from slomo.packed import unpack
 from slomo.pinhole import Intrinsics, ground_points
 from slomo.prior.frames import every, spread
 from slomo.reconstruct.steady import steadied
@@ -61,11 +62,6 @@ class Observations:
     flow_size: float
 
 
-def unpack(packed: Array, shape: Array) -> Array:
-    """(T, H, W) bool of bits packed along the last axis."""
-    return np.unpackbits(packed, axis=-1)[..., : int(shape[-1])].astype(bool)
-
-
 def observe(
     frames_t: Array, masks: Mapping[str, Array], flow: Mapping[str, Array], camera: Mapping[str, Array],
     *, fps: float, subject_px: float,
@@ -86,14 +82,14 @@ def observe(
     if len(set(counts.values())) != 1:
         raise InvalidData(f"the parts disagree about the number of frames: {counts}", where="reconstruct")
     at = np.arange(0, T, every(frames_t, fps))
-    area = np.array([unpack(masks["packed"][k], masks["shape"]).sum() for k in at])
+    area = np.array([unpack(masks, k).sum() for k in at])
     if not (area > 0).any():
         raise InvalidData("no frame shows the subject", where="masks", todo="give masks with --masks")
     scale = min(1.0, subject_px / float(np.sqrt(np.median(area[area > 0]))))
     if len(at) * height * width * scale**2 > MOST_PIXELS:
         at = np.arange(0, T, every(frames_t, min(fps, LONG_FPS)))
         scale = min(scale, float(np.sqrt(MOST_PIXELS / (len(at) * height * width))))
-    full = [unpack(masks["packed"][k], masks["shape"]) for k in at]
+    full = [unpack(masks, k) for k in at]
     w, h = max(16, round(width * scale)), max(16, round(height * scale))
     scale = np.array([w / width, h / height])  # not quite alike: both sides are whole numbers of pixels
     smaller = lambda x: cv2.resize(np.asarray(x, np.float32), (w, h), interpolation=cv2.INTER_AREA)  # noqa: E731
@@ -138,7 +134,7 @@ def _background(masks: Mapping[str, Array], flow: Mapping[str, Array]) -> Array:
     rows, columns = flow["flow"].shape[1:3]
     there = np.unpackbits(flow["consistent"], axis=-1)[:, :, :columns].astype(bool)
     for k in range(len(there)):
-        mask = cv2.dilate(unpack(masks["packed"][k], masks["shape"]).astype(np.uint8), np.ones((9, 9), np.uint8))
+        mask = cv2.dilate(unpack(masks, k).astype(np.uint8), np.ones((9, 9), np.uint8))
         there[k] &= cv2.resize(mask.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA) == 0
     return there
 

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from slomo.errors import StageFailed, UsageError
 from slomo.mesh import SkinnedMesh
+from slomo.packed import unpack
 from slomo.reconstruct.body_colours import coloured_by_clip
 from slomo.reconstruct.body_mesh import body_mesh, field_mesh
 from slomo.reconstruct.descent import Plan, descend
@@ -18,7 +19,6 @@ from slomo.reconstruct.fields.config import FieldsConfig
 from slomo.reconstruct.fields.device import CPU, find, on
 from slomo.reconstruct.fields.mesh import mesh
 from slomo.reconstruct.fit_stage import FitConfig, Prepared, one_thread, prepare
-from slomo.reconstruct.observations import unpack
 from slomo.reconstruct.outcome import Outcome, assess
 from slomo.reconstruct.physics.learn import PhysicsConfig
 from slomo.reconstruct.run import Run, from_arrays
@@ -148,7 +148,7 @@ def _mesh(
         surface = mesh(on(run.x, device), fields, on(kin, device), on(shape, device))
         return field_mesh(surface, kin, shape, outcome.body, t, metres_per_unit=unit)
     skin = body_mesh(kin, shape, outcome.body, t, metres_per_unit=unit)
-    masks = unpack(made.masks["packed"], made.masks["shape"])
+    masks = unpack(made.masks)
     return coloured_by_clip(skin, lambda k: frames[k], lambda k: masks[k], np.asarray(made.K), outcome.T_world_cam)
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slomo.errors import InvalidData, UsageError
+from slomo.packed import pack, unpack
 from slomo.stage import Artifact, Inputs, Progress
 
 MASKS_VERSION = 26
@@ -165,16 +166,6 @@ def _focal(config: CameraConfig, hint: float, size: tuple[int, int]) -> tuple[fl
     if hint:
         return hint, 0.05, "the clip's metadata"
     return 0.5 * max(size) / float(np.tan(0.5 * np.radians(config.default_fov_deg))), 0.2, "default"
-
-
-def pack(masks: np.ndarray) -> dict[str, np.ndarray]:
-    """(T, H, W) bool as packed bits and their shape."""
-    return {"packed": np.packbits(masks, axis=-1), "shape": np.array(masks.shape)}
-
-
-def unpack(arrays) -> np.ndarray:
-    """Inverse of `pack`: (T, H, W) bool."""
-    return np.unpackbits(arrays["packed"], axis=-1)[..., : int(arrays["shape"][2])].astype(bool)
 
 
 def _segmented(segmenter, config: MasksConfig, choice, frames: np.ndarray, flow, progress: Progress):

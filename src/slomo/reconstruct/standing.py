@@ -8,7 +8,7 @@ Rabiner 1989), and the feet of a stance are brought to their one place on the gr
 import numpy as np
 import torch
 
-from slomo.reconstruct.kinematics import Kinematics
+from slomo.reconstruct.kinematics import Kinematics, limb_links
 
 Array = np.ndarray
 Tensor = torch.Tensor
@@ -93,7 +93,7 @@ def stand(kin: Kinematics, shape: dict[str, Tensor], position: Tensor, R: Tensor
     Args:
         shape, position (1, T, 3), R (1, T, 3, 3), q (1, T, B, 3): as `Kinematics.pose` takes them.
     """
-    chains = [_chain(kin, limb.swing, limb.contact) for limb in kin.skeleton.limbs]
+    chains = [limb_links(kin.skeleton, limb) for limb in kin.skeleton.limbs]
     longest = max(map(len, chains))
     goal = torch.as_tensor(target, dtype=torch.float32)
     length = float(shape["log_length"].exp()[0])
@@ -119,15 +119,6 @@ def stand(kin: Kinematics, shape: dict[str, Tensor], position: Tensor, R: Tensor
             for n, j in enumerate(chain):
                 q[0, :, j] += change[:, f, 3 * n : 3 * n + 3]
     return q
-
-
-def _chain(kin: Kinematics, swing: int, contact: int) -> list[int]:
-    """The links from the joint that swings a limb to its contact."""
-    out, node = [], int(kin.link[contact])
-    while node != int(kin.link[swing]) and node > 0:
-        out.append(node)
-        node = int(kin.link[node])
-    return out[::-1]
 
 
 def _logistic(x: Array) -> Array:

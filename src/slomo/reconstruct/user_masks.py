@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from slomo.errors import InvalidData
+from slomo.packed import unpack
 from slomo.reconstruct.flow import Flow
 from slomo.reconstruct.segment import Masks, Report, no_subject
 
@@ -71,7 +72,7 @@ def _from_archive(path: Path) -> np.ndarray:
     try:
         with np.load(path, allow_pickle=False) as z:
             shape = tuple(int(n) for n in z["shape"])
-            masks = np.unpackbits(z["packed"], axis=-1)[..., : shape[2]].astype(bool)
+            masks = unpack(z)
     except (OSError, ValueError, KeyError, IndexError, TypeError, EOFError) as error:
         raise InvalidData(
             f"cannot be read as masks ({error})", where=path, todo="give an npz with arrays packed and shape"

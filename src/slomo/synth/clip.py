@@ -10,6 +10,7 @@ import numpy as np
 
 from slomo.errors import UsageError
 from slomo.formats.mp4 import encode_mp4
+from slomo.packed import pack
 from slomo.raycast import Part, Scene
 from slomo.stage import Progress
 from slomo.synth.actor import ACTORS, Actor, act, moves
@@ -159,6 +160,6 @@ def write_clip(out_dir: Path, config: Config, progress: Progress) -> None:
     clip = encode_mp4(frames(), config.fps, crf=config.crf, preset="slow")
     out_dir.mkdir(parents=True, exist_ok=True)
     stack = np.stack(masks)
-    np.savez_compressed(out_dir / "masks.npz", packed=np.packbits(stack, axis=-1), shape=np.array(stack.shape))
+    np.savez_compressed(out_dir / "masks.npz", allow_pickle=False, **pack(stack))
     np.savez_compressed(out_dir / "truth.npz", **arrays)
     (out_dir / "clip.mp4").write_bytes(clip)
