@@ -13,7 +13,8 @@ from slomo.ground_path import whittaker
 from slomo.pinhole import Intrinsics
 from slomo.reconstruct import hypotheses, posture, silhouette
 from slomo.reconstruct.hypotheses import GaitHypothesis
-from slomo.reconstruct.kinematics import SHIFT_SPREAD, Kinematics, joint_rotation, rot
+from slomo.reconstruct.kinematics import NODE_SPREAD, SHIFT_SPREAD, Kinematics, joint_rotation, rot
+from slomo.reconstruct.refine_stage import stretch
 from slomo.reconstruct.silhouette import Outline
 from slomo.reconstruct.state import State
 from slomo.skeleton import list_skeletons, load_skeleton
@@ -55,6 +56,20 @@ def test_mirrored_angles_give_the_mirrored_body(kin: Kinematics):
     for end in ("a", "b"):
         flesh, image = getattr(one, end)[0, 0].numpy(), getattr(two, end)[0, 0].numpy()
         np.testing.assert_allclose(image[other][pairs] * [1, -1, 1], flesh[pairs], atol=1e-5)
+
+
+def test_a_bone_that_is_not_the_skeletons_is_told_of_but_for_tails():
+    kin = Kinematics(load_skeleton("quadruped"))
+    shape = kin.shape_variables(1) | {"log_length": torch.tensor([0.7])}
+    np.testing.assert_allclose(stretch(kin, shape), 1.0, atol=1e-6)
+    node = dict(zip(kin.skeleton.names, kin.node_variable.tolist(), strict=True))
+    shape["node"][0, [node["tail_mid"], node["tail_tip"]]] = -6.0
+    np.testing.assert_allclose(stretch(kin, shape), 1.0, atol=1e-6)
+    shape["node"][0, node["hind_left_hock"]] = 3.0
+    changed = stretch(kin, shape)
+    assert (changed > 1.3).sum() == 2  # it and the right one
+    assert changed.max() < np.exp(3.0 * NODE_SPREAD)  # less, the shorter it is
+    assert changed.min() == pytest.approx(1.0)
 
 
 def test_bones_keep_their_lengths(kin: Kinematics):

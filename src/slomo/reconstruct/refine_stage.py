@@ -19,6 +19,7 @@ from slomo.reconstruct.fields.config import FieldsConfig
 from slomo.reconstruct.fields.device import CPU, find, on
 from slomo.reconstruct.fields.mesh import mesh
 from slomo.reconstruct.fit_stage import FitConfig, Prepared, one_thread, prepare
+from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.outcome import Outcome, assess
 from slomo.reconstruct.physics.learn import PhysicsConfig
 from slomo.reconstruct.run import Run, from_arrays
@@ -123,7 +124,6 @@ def _tremble(given: np.ndarray, steady: np.ndarray) -> float:
 def _facts(inputs: Inputs, made: Prepared, run: Run, outcome: Outcome) -> Facts:
     kin, unit = made.problem.kin, outcome.metres_per_unit
     shape = {k.removeprefix("shape."): v for k, v in run.x.items() if k.startswith("shape.")}
-    offset, rest = kin.offsets(shape)[0].norm(dim=-1), kin.offset.norm(dim=-1)
     own = shape["log_length"].exp()[0]
     return Facts(
         report=outcome.report,
@@ -133,8 +133,16 @@ def _facts(inputs: Inputs, made: Prepared, run: Run, outcome: Outcome) -> Facts:
         sole=made.skeleton.sole * float(own) * unit,
         t=made.problem.obs.t.numpy().astype(float),
         length=made.metres,
-        stretch=((offset / own + SHORT) / (rest + SHORT)).numpy(),
+        stretch=stretch(kin, shape),
     )
+
+
+def stretch(kin: Kinematics, shape: dict[str, torch.Tensor]) -> np.ndarray:
+    """(M,) lengths of the bones of one hypothesis over the skeleton's own, the body's length taken off; of short ones
+    less, and tails do not count: with a short one or a long one a body moves the same."""
+    offset, rest = kin.offsets(shape)[0].norm(dim=-1), kin.offset.norm(dim=-1)
+    ratio = (offset / shape["log_length"].exp()[0] + SHORT) / (rest + SHORT)
+    return ratio[torch.tensor(["tail" not in name for name in kin.skeleton.names])].numpy()
 
 
 def _mesh(
