@@ -6,8 +6,10 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
 from elsewhere import DEVICE, Elsewhere
+from slomo.cli import app
 from slomo.errors import StageFailed, UsageError
 from slomo.reconstruct import refine_stage
 from slomo.reconstruct.fields.device import VARIABLE, find, on
@@ -110,6 +112,18 @@ def test_a_gpu_is_asked_for_only_where_the_fields_would_use_it(fitted, monkeypat
     assert out.json["report.json"]["device"] == "cpu"
     with pytest.raises(UsageError, match="no device"):
         run_refine(fitted, CONFIG, Silent())
+
+
+def test_a_wrong_device_is_told_of_before_anything_begins(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    """Nothing is made of the clip, which is none; who does without the fields does without their device."""
+    monkeypatch.setenv(VARIABLE, "gpu")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "clip.mp4").write_text("no clip")
+    call = lambda *more: CliRunner().invoke(app, ["reconstruct", "clip.mp4", *more])  # noqa: E731
+    named = call()
+    assert named.exit_code == 2
+    assert "no device 'gpu'" in named.stderr
+    assert "no device" not in call("--quality", "draft").stderr
 
 
 def test_a_gpu_with_too_little_memory_is_no_crash(fitted, monkeypatch: pytest.MonkeyPatch):

@@ -1,5 +1,6 @@
 """The commands that make artifacts, from the clip to the reference, the report, and all at once."""
 
+import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -143,6 +144,10 @@ def add_commands(app: typer.Typer) -> None:
         if clip is not None:
             changes["inputs"] |= {"clip": session.user_path(clip, "clip")} | session.choice_reopened("clip")
         project = session.configure(changes)
+        if os.environ.get("SLOMO_DEVICE"):  # a wrong one would be told of after minutes, when the fields begin
+            from slomo.reconstruct.refine_stage import device_of
+
+            device_of(project.config("reconstruct"))
         session.emit_artifact(session.runner(project).make("reconstruct"))
 
     @command(app, "import", runs=True)
@@ -270,6 +275,10 @@ def add_commands(app: typer.Typer) -> None:
         slomo run two.mp4 --robot go1 --subject-box 500,200,800,420
         slomo run keypoints.npz --robot go1
         """
+        if os.environ.get("SLOMO_DEVICE"):  # wrong, it would be told of after minutes, when the fields begin
+            from slomo.reconstruct.fields.device import find
+
+            find(large=True)
         evidence = _evidence(session, prior, keypoints2d, keypoint_model, keypoint_map)
         who = chosen_subject(segmenter, subject_at, subject_box)
         changes = _from_clip(session, skeleton, who, masks, weights, start, duration, length, quality, fov, evidence)

@@ -85,7 +85,7 @@ def run_refine(inputs: Inputs, config: ReconstructConfig, progress: Progress) ->
     made = prepare(inputs, config)
     run = from_arrays(inputs.artifacts["fit"].npz["fit.npz"])
     plan = config.plan()
-    device = find(large=config.networks == "published") if plan.fields else CPU
+    device = device_of(config)
     frames = np.asarray(inputs.artifacts["decode"].npz["frames.npz"]["frames"])
     try:
         with one_thread():
@@ -113,6 +113,15 @@ def run_refine(inputs: Inputs, config: ReconstructConfig, progress: Progress) ->
     failure = f"not usable: {found['text']}" if found["trust"] == "unusable" else None
     npz = {"keypoints.npz": _arrays(made, outcome), "mesh.npz": body.to_arrays()}
     return Artifact(npz=npz, json={"report.json": report}, failure=failure)
+
+
+def device_of(config: ReconstructConfig) -> torch.device:
+    """Where the fields are computed, where there are any.
+
+    Raises:
+        UsageError: as `find` does.
+    """
+    return find(large=config.networks == "published") if config.plan().fields else CPU
 
 
 def _tremble(given: np.ndarray, steady: np.ndarray) -> float:
