@@ -76,19 +76,26 @@ def retreating(seed: int, degrees: float):
     return R.as_matrix(), p, Tracks(*(np.concatenate(column) for column in (frame, track, xy)))
 
 
+def path_of(R: np.ndarray, tracks: Tracks, focal: float, *, refine_focal: bool):
+    """The path that the tracks give, the degrees by which its rotations are off at most, and its correspondences."""
+    keys, gaps = np.arange(len(R)), (1, 3, 8, 16)
+    epipolar = Epipolar(tracks, keys, gaps, CENTER, 0)
+    assert epipolar.least_shared > 20
+    turning = rotation_ba.fit_rotations(
+        *tracks.pairs(gaps, keys), len(keys), center=CENTER, focal=focal, refine_focal=False
+    )
+    path = track_path(epipolar, tracks, keys, CENTER, focal, 0, turning.R_world_cam, refine_focal=refine_focal)
+    turned = Rotation.from_matrix(path.T_world_cam[:, :3, :3]) * Rotation.from_matrix(R[0].T @ R).inv()
+    return path, float(np.degrees(turned.magnitude()).max()), epipolar
+
+
 @pytest.mark.parametrize(("seed", "degrees"), [(0, 14.0), (1, -8.0), (2, 40.0)])
 def test_path_before_one_plane(seed, degrees):
     """A plane, before which incremental structure from motion may take the wrong one of two motions."""
     R, p, tracks = retreating(seed, degrees)
-    keys = np.arange(len(R))
-    epipolar = Epipolar(tracks, keys, (1, 3, 8, 16), CENTER, 0)
-    assert epipolar.least_shared > 20
-    turning = rotation_ba.fit_rotations(
-        *tracks.pairs((1, 3, 8, 16), keys), len(keys), center=CENTER, focal=FOCAL, refine_focal=False
-    )
-    path = track_path(epipolar, tracks, keys, CENTER, FOCAL, 0, turning.R_world_cam)
-    turned = Rotation.from_matrix(path.T_world_cam[:, :3, :3]) * Rotation.from_matrix(R[0].T @ R).inv()
-    assert np.degrees(turned.magnitude()).max() < 1.0
+    path, off, epipolar = path_of(R, tracks, FOCAL, refine_focal=False)
+    assert off < 1.0
+    assert path.focal == FOCAL
     assert path.in_front > 0.97
     truth = (p - p[0]) @ R[0]
     scale = np.linalg.norm(truth[-1]) / np.linalg.norm(path.T_world_cam[-1, :3, 3])
@@ -96,3 +103,20 @@ def test_path_before_one_plane(seed, degrees):
     T = np.tile(np.eye(4), (len(R), 1, 1))
     T[:, :3, :3], T[:, :3, 3] = R, p
     assert path.cost < 1.1 * epipolar.cost(T, FOCAL)
+
+
+@pytest.mark.parametrize("degrees", [40.0, 60.0])
+def test_a_wrong_focal_length_does_not_bend_the_path_of_a_camera_that_turns_far(degrees):
+    R, _, tracks = retreating(2, degrees)
+    kept, bent, _ = path_of(R, tracks, 1.2 * FOCAL, refine_focal=False)
+    assert kept.focal == 1.2 * FOCAL
+    found, off, _ = path_of(R, tracks, 1.2 * FOCAL, refine_focal=True)
+    assert found.focal == pytest.approx(FOCAL, rel=0.08)  # so much a plane tells
+    assert off < min(2.0, 0.5 * bent)
+
+
+def test_a_focal_length_that_tracks_hardly_tell_is_kept():
+    """Let go it would be 1.5 times the true one, at a cost that is lower by a hundredth."""
+    R, _, tracks = retreating(1, -8.0)
+    path, _, _ = path_of(R, tracks, 1.2 * FOCAL, refine_focal=True)
+    assert path.focal == 1.2 * FOCAL

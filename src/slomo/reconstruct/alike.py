@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from slomo.reconstruct import limb_track
+from slomo.reconstruct import limb_track, sides
 from slomo.reconstruct.hypotheses import as_guess
 from slomo.reconstruct.kinematics import limb_links
 from slomo.reconstruct.pose_track import smooth
@@ -28,7 +28,10 @@ LEAST = 0.15  # rad: a stride that is nearer to the other than this stays what i
 TEMPLATES = 8  # strides at most that others may be done as
 AS_LIKE = 1.15  # times as unlike as after the best period: a shorter one that is no worse is the stride
 OFF = 0.25  # share by which the stride period may differ from a given one
+ALOFT = 0.12  # body lengths: a paw that is higher for all but `LOW` of the time hardly ever comes down
+LOW = 0.25
 _PHASES = 8  # places in a stride at which it may be cut
+_LAGS = 12  # times of a stride at which a leg may do what the other one does
 
 
 def borrowed(
@@ -53,6 +56,37 @@ def borrowed(
     step = int(problem.obs.at[1] - problem.obs.at[0])
     for chain, change in zip(limbs, changes, strict=True):
         q[:, chain] += smooth(change, 2 * step + 1).reshape(len(q), -1, 3)
+    return x, replace(guess, q=torch.as_tensor(q, dtype=torch.float32)[None])
+
+
+def as_the_other(
+    problem: Problem, x: Variables, guess: Guess, *, clock: Array, frequencies: Sequence[float]
+) -> tuple[Variables, Guess] | None:
+    """One hypothesis in which a leg that hardly ever comes down does as the one of the other side, at that time of the
+    stride at which it is seen best, as a guess with no corrections to it; None where all legs come down, or a pair has
+    none that does. A leg that is laid into a large head, say, covers it, and finds no way back.
+
+    Args:
+        clock, frequencies: as of `borrowed`.
+    """
+    kin = problem.kin
+    x, guess = as_guess(problem, x, guess)
+    height = np.quantile(sides.feet(problem, x, guess)[0, :, :, 2].numpy() - kin.skeleton.sole, LOW, axis=0)
+    limbs = [limb_links(kin.skeleton, limb) for limb in kin.skeleton.limbs]
+    lost = [(a, b) for pair in kin.pairs.tolist() for a, b in (pair, pair[::-1]) if height[b] < ALOFT < height[a]]
+    q = guess.q[0].numpy().astype(float)
+    stand = sorted({j for n, chain in enumerate(limbs) if height[n] < ALOFT for j in chain})
+    period = _period(q[:, stand, 1], clock, frequencies) if lost else None
+    if period is None:
+        return None
+    mirrored, at = kin.mirrored(guess.q)[0].numpy(), problem.obs.at.numpy()
+    for leg, _ in lost:
+        own = mirrored[:, limbs[leg]]
+        then = clock[:, None] - period * np.arange(_LAGS) / _LAGS
+        then = np.where(then < clock[0], then + period, then)
+        done = _at(own.reshape(len(q), -1), clock, then).reshape(len(q), _LAGS, -1, 3)
+        cost = limb_track.costs(problem, x, guess, limbs[leg], done[at]).mean(0)
+        q[:, limbs[leg]] = done[:, int(cost.argmin())]
     return x, replace(guess, q=torch.as_tensor(q, dtype=torch.float32)[None])
 
 

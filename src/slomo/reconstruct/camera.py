@@ -185,12 +185,12 @@ def _structure(
     center = np.array([(w - 1) / 2, (h - 1) / 2])
     keys, gaps = _key_frames(t, shown, s.key_every)
 
-    def solve(keys: np.ndarray, path: np.ndarray | None = None) -> sfm.Structure | None:
+    def solve(keys: np.ndarray, focal: float, path: np.ndarray | None = None) -> sfm.Structure | None:
         return sfm.reconstruct_structure(
             frames,
             masks,
             keys,
-            focal=s.focal,
+            focal=focal,
             refine_focal=s.refine_focal,
             features=s.features,
             overlap=s.overlap,
@@ -207,9 +207,10 @@ def _structure(
 
     placed, explained, path = None, np.inf, None
     if (epipolar := Epipolar(tracks, keys, gaps, center, s.seed)).least_shared >= _LEAST_CORNERS:
-        path = track_path(epipolar, tracks, keys, center, s.focal, s.seed, turning_R)
+        refine = s.refine_focal
+        path = track_path(epipolar, tracks, keys, center, s.focal, s.seed, turning_R, refine_focal=refine)
     if path is not None:
-        if path.in_front > _IN_FRONT and (structure := solve(keys, path.T_world_cam)):
+        if path.in_front > _IN_FRONT and (structure := solve(keys, path.focal, path.T_world_cam)):
             explained = epipolar.cost(structure.T_world_cam, structure.focal)
             placed = structure if explained < _AGREES * path.cost else None
         if placed and path.agreed:
@@ -220,7 +221,7 @@ def _structure(
         if len(more) == tried:
             break
         tried = len(more)
-        mapped = solve(more)
+        mapped = solve(more, s.focal)
         report |= {"key_frames": tried, "key_frames_registered": 0 if mapped is None else len(mapped.frames)}
         if mapped is not None and len(mapped.frames) >= sfm.ENOUGH * tried:
             compared = Epipolar(tracks, mapped.frames, gaps, center, s.seed)

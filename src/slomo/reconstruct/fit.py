@@ -213,6 +213,9 @@ def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effor
         if (found := _borrowed(problem, run, labels[0], rivals[-1], root)) is not None:
             rivals.append(found)
             labels.append(labels[-1] | {"strides": "alike"})
+        if (found := _borrowed(problem, run, labels[0], rivals[0], root, alike.as_the_other)) is not None:
+            rivals.append(found)
+            labels.append(labels[0] | {"limbs": "as the other side's"})
         more = [("exchanged", *rival) for rival in sides.exchanged_pairs(problem, best.x, best.guess)]
         if _either_way(problem, root):
             more.append(("seen", "the other way", *hypotheses.turned_around(problem, best.x, best.guess)))
@@ -225,24 +228,24 @@ def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effor
 
 
 def _borrowed(
-    problem: Problem, run: Run, label: dict, motion: tuple[Variables, Guess], root: RootGuess
+    problem: Problem, run: Run, label: dict, motion: tuple[Variables, Guess], root: RootGuess, how=alike.borrowed
 ) -> tuple[Variables, Guess] | None:
-    """A motion with its strides done as others of them, of who strides."""
+    """A motion with its strides done as others of them (or what else of `alike`), of who strides."""
     if label["gait"] == "none" and root.travelled <= 1:
         return None
     hz = [label["stride_hz"]] if "stride_hz" in label else run.log["stride_candidates_hz"]
-    return alike.borrowed(problem, *motion, clock=gaits.steps(problem, root).clock, frequencies=hz)
+    return how(problem, *motion, clock=gaits.steps(problem, root).clock, frequencies=hz)
 
 
 def _to_alike(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, *_) -> Run:
     """The best one goes on beside itself with alike strides, which show more of it once the limbs have been fitted."""
     best = _winner(run, preferences.alike(run.labels, losses, _ALIKE[run.phase]))
-    found = None
+    rivals = []
     if effort.schedules[PHASES.index("alike")].iterations:
-        found = _borrowed(problem, best, best.labels[0], (best.x, best.guess), root)
-    if found is None:
-        return _overtaking(problem, best, root, effort)
-    return _beside(best, "alike", [("again", *found)])
+        for name, how in (("again", alike.borrowed), ("as the other side's", alike.as_the_other)):
+            if (found := _borrowed(problem, best, best.labels[0], (best.x, best.guess), root, how)) is not None:
+                rivals.append((name, *found))
+    return _beside(best, "alike", rivals) if rivals else _overtaking(problem, best, root, effort)
 
 
 def _to_overtaking(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, *_) -> Run:

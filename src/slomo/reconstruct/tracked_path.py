@@ -20,6 +20,9 @@ _MOST_SHARED = 40  # correspondences of two frames, on average, that are used
 _MOST_TRACKS = 2000
 _ROUNDS = 6
 _SETTLED = 0.98  # of the cost before, above which another round is of no use
+# Of the cost with the focal length that is given, below which another one is taken. A wrong one bends the path of a
+# camera that turns far, and bundle adjustment does not find back from there; elsewhere the tracks hardly tell it.
+_BETTER = 0.9
 # Weight of the path's second differences, of the mean weight that the tracks give a frame's position: while rotations
 # are wrong, and when they are right.
 _SMOOTH, _SETTLED_SMOOTH = 1e-2, 1e-5
@@ -31,12 +34,14 @@ class TrackedPath:
 
     Attributes:
         T_world_cam: (N, 4, 4) OpenCV convention; the first frame's camera is the world, the scale is arbitrary.
+        focal: px.
         cost: of `Epipolar.cost`.
         in_front: part of the sightings whose point lies before the camera.
         agreed: whether another start led to the same.
     """
 
     T_world_cam: np.ndarray
+    focal: float
     cost: float
     in_front: float
     agreed: bool = False
@@ -115,41 +120,50 @@ def track_path(
     focal: float,
     seed: int,
     turning: np.ndarray,
+    *,
+    refine_focal: bool,
 ) -> TrackedPath | None:
     """Cameras of the frames `keys` (N,); None where no track is seen in three of them, which alone tells how far each
     is from the next.
 
     Args:
         epipolar: correspondences of the tracks between these frames.
-        center: (2,) px, principal point.  focal: px, kept.  seed: of the draw of tracks where there are many.
+        center: (2,) px, principal point.  focal: px; kept when not `refine_focal`, and where another one explains the
+            tracks little better.  seed: of the draw of tracks where there are many.
         turning: (N, 3, 3) rotations of a camera of this focal length that only turns and explains as much as it can.
             Which part of them is travel is unknown: the path is sought from all of them, none and half, until two
             agree. (One of refined focal length turns by several times as much where there is parallax.)
     """
-    sightings = _Sightings(tracks, keys, center, focal, seed)
+    sightings = _Sightings(tracks, keys, center, seed)
     if len(sightings.track) == 0:
         return None
     turns = Rotation.from_matrix(turning[0].T @ turning).as_rotvec()
     found: list[TrackedPath] = []
     for share in (1.0, 0.0, 0.5):
-        found.append(_from(epipolar, sightings, Rotation.from_rotvec(share * turns).as_matrix(), focal))
+        start = Rotation.from_rotvec(share * turns).as_matrix()
+        found.append(_from(epipolar, sightings, start, focal, free_focal=False))
         found.sort(key=lambda path: path.cost)
         if len(found) > 1 and _SETTLED * found[1].cost < found[0].cost:
-            return replace(found[0], agreed=True)
+            found[0] = replace(found[0], agreed=True)
+            break
+    if refine_focal:
+        freed = _from(epipolar, sightings, found[0].T_world_cam[:, :3, :3], focal, free_focal=True)
+        if freed.cost < _BETTER * found[0].cost:
+            return freed
     return found[0]
 
 
-def _from(epipolar: Epipolar, sightings: "_Sightings", R: np.ndarray, focal: float) -> TrackedPath:
+def _from(epipolar: Epipolar, sightings: "_Sightings", R: np.ndarray, focal: float, *, free_focal: bool) -> TrackedPath:
     """The path from rotations R (N, 3, 3)."""
     N, last = len(R), np.inf
 
     def move(state, step):
         R, p, focal = state
-        step = step[:-1].reshape(N, 6)
-        return R @ Rotation.from_rotvec(step[:, :3]).as_matrix(), p + step[:, 3:], focal
+        turn = step[:-1].reshape(N, 6)
+        return R @ Rotation.from_rotvec(turn[:, :3]).as_matrix(), p + turn[:, 3:], focal * float(np.exp(step[-1]))
 
     for _ in range(_ROUNDS):
-        start = R, sightings.positions(R, _SMOOTH)[0], focal
+        start = R, sightings.positions(R, focal, _SMOOTH)[0], focal
         found = minimise(
             start,
             epipolar.linearise,
@@ -157,25 +171,25 @@ def _from(epipolar: Epipolar, sightings: "_Sightings", R: np.ndarray, focal: flo
             epipolar.i,
             epipolar.j,
             N,
-            np.arange(6, 6 * N),
+            np.arange(6, 6 * N + free_focal),
             iterations=15,
             settled=1e-4,
         )
-        R = found.state[0]
+        R, _, focal = found.state
         if found.cost > _SETTLED * last:
             break
         last = found.cost
     # Of frames along one line, pairs tell directions only: how far each is from the next, the points do.
-    p, in_front = sightings.positions(R, _SETTLED_SMOOTH)
+    p, in_front = sightings.positions(R, focal, _SETTLED_SMOOTH)
     T = np.tile(np.eye(4), (N, 1, 1))
     T[:, :3, :3], T[:, :3, 3] = R[0].T @ R, (p - p[0]) @ R[0]
-    return TrackedPath(T, epipolar.cost(T, focal), in_front)
+    return TrackedPath(T, focal, epipolar.cost(T, focal), in_front)
 
 
 class _Sightings:
-    """Rays of tracks that are seen in three of the frames `keys` or more."""
+    """Tracks that are seen in three of the frames `keys` or more."""
 
-    def __init__(self, tracks: Tracks, keys: np.ndarray, center: np.ndarray, focal: float, seed: int):
+    def __init__(self, tracks: Tracks, keys: np.ndarray, center: np.ndarray, seed: int):
         at = tracks.places(keys)
         times = np.bincount(tracks.track[at >= 0])
         enough = np.flatnonzero(times >= 3)
@@ -185,13 +199,12 @@ class _Sightings:
         order = np.lexsort((at[keep], tracks.track[keep]))
         self.frame = at[keep][order]
         _, self.track = np.unique(tracks.track[keep][order], return_inverse=True)
-        ray = np.column_stack([(tracks.xy[keep][order] - center) / focal, np.ones(len(order))])
-        self.ray = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
-        self.focal, self.count = focal, len(keys)
+        self.xy, self.count = tracks.xy[keep][order] - center, len(keys)
 
-    def positions(self, R: np.ndarray, smooth: float, iterations: int = 8) -> tuple[np.ndarray, float]:
-        """Positions (N, 3) of cameras with rotations R (N, 3, 3), the first at the origin, that see the tracks' points
-        with the least reprojection error; and which part of the sightings are of points in front.
+    def positions(self, R: np.ndarray, focal: float, smooth: float, iterations: int = 8) -> tuple[np.ndarray, float]:
+        """Positions (N, 3) of cameras with rotations R (N, 3, 3) and this focal length, px, the first at the origin,
+        that see the tracks' points with the least reprojection error; and which part of the sightings are of points in
+        front.
 
         The squared distances between points and rays, divided by the squared depths of the step before, are those of
         the reprojection errors. The mean weighted depth is 1, or all would shrink to one place. Rotations that are
@@ -199,7 +212,8 @@ class _Sightings:
         """
         N, frame, track = self.count, self.frame, self.track
         M = int(track.max()) + 1
-        ray = np.einsum("pab,pb->pa", R[frame], self.ray)
+        ray = np.column_stack([self.xy / focal, np.ones(len(self.xy))])
+        ray = np.einsum("pab,pb->pa", R[frame], ray / np.linalg.norm(ray, axis=-1, keepdims=True))
         across = np.eye(3) - ray[:, :, None] * ray[:, None]
         start = np.flatnonzero(np.r_[True, np.diff(track) != 0])
         bend = np.diff(np.eye(N), 2, axis=0)
@@ -229,7 +243,7 @@ class _Sightings:
             away = (points @ flat)[track] - p[frame]
             depth = (away * ray).sum(-1)
             size = np.maximum(np.abs(depth), 0.1 * np.median(np.abs(depth)))
-            error = self.focal * np.linalg.norm(away - depth[:, None] * ray, axis=-1) / size + self.focal * (depth < 0)
+            error = focal * (np.linalg.norm(away - depth[:, None] * ray, axis=-1) / size + (depth < 0))
             weight = np.minimum(1.0, np.maximum(1.0, np.median(error)) / np.maximum(error, 1e-6)) / size**2
             weight /= weight.mean()
         return p / np.linalg.norm(np.diff(p, axis=0), axis=-1).mean(), float((depth > 0).mean())
