@@ -17,31 +17,37 @@ from test_fit_people import FPS, T, problem_of
 STRIDE = 6  # frames
 CLOCK = np.arange(T) / FPS
 CENTRE = np.array([0.0, -4.5, 0.6])  # of a camera that sees the right flank
-RAISED = {"front_right_shoulder": -40.0, "front_right_elbow": -85.0}
+RAISED = {"shoulder": -40.0, "elbow": -85.0}
+SWINGS = {"right": (1, 2), "left": (4, 5)}  # frames of a stride in which a front paw is up
 INF = math.inf
+
+
+def up(*legs: tuple[str, np.ndarray]) -> np.ndarray:
+    """(T, B, 3) rad of a dog whose front paws on these sides are up in these frames."""
+    kin = Kinematics(load_skeleton("quadruped"))
+    q = np.zeros((T, kin.B, 3))
+    for side, frames in legs:
+        for joint, degrees in RAISED.items():
+            q[frames, kin.skeleton.names.index(f"front_{side}_{joint}"), 1] = np.radians(degrees)
+    return q
 
 
 def raising(strides) -> np.ndarray:
     """(T, B, 3) rad of a dog that raises its right front paw in the middle of these strides."""
-    kin = Kinematics(load_skeleton("quadruped"))
-    q = np.zeros((T, kin.B, 3))
-    for k in strides:
-        for joint, degrees in RAISED.items():
-            q[k * STRIDE + 2 : k * STRIDE + 5, kin.skeleton.names.index(joint), 1] = np.radians(degrees)
-    return q
+    return up(("right", np.array([k * STRIDE + n for k in strides for n in (2, 3, 4)], int)))
 
 
-def of(seen, fitted):
-    """A paw is seen up in some strides and fitted so in some."""
-    problem, root = problem_of(np.zeros(T), raising(seen), skeleton="quadruped", centre=CENTRE)
+def of(seen: np.ndarray, fitted: np.ndarray):
+    """One motion (T, B, 3) is seen, another one fitted."""
+    problem, root = problem_of(np.zeros(T), seen, skeleton="quadruped", centre=CENTRE)
     guess = hypotheses.placed(problem.kin, root, np.zeros((1, T)))
-    guess = replace(guess, q=torch.as_tensor(raising(fitted), dtype=torch.float32)[None])
+    guess = replace(guess, q=torch.as_tensor(fitted, dtype=torch.float32)[None])
     return problem, root, problem.variables(1, torch.Generator().manual_seed(0)), guess
 
 
 def done(seen, fitted, frequencies=(FPS / STRIDE,)) -> np.ndarray | None:
     """(T,) degrees of the elbow after strides were borrowed."""
-    problem, _, x, guess = of(seen, fitted)
+    problem, _, x, guess = of(raising(seen), raising(fitted))
     found = alike.borrowed(problem, x, guess, clock=CLOCK, frequencies=frequencies)
     elbow = problem.kin.skeleton.names.index("front_right_elbow")
     return None if found is None else np.degrees(found[1].q[0, :, elbow, 1].numpy())
@@ -68,7 +74,7 @@ def test_once_the_limbs_are_fitted_strides_are_borrowed_again(monkeypatch):
     effort = fit.Effort((Schedule(1, 2, 8, ()),) * len(fit.PHASES), 1, 1)
 
     def after_limbs(fitted, effort=effort):
-        problem, root, x, guess = of(range(4), fitted)
+        problem, root, x, guess = of(raising(range(4)), raising(fitted))
         run = Run(fit.LIMBS, x, guess, [label], {"limbs": [{}]})
         return fit._to_alike(problem, run, rank(problem, x, guess), replace(root, travelled=3.0), effort)
 
@@ -99,6 +105,61 @@ def test_alike_strides_say_nothing_against_exchanged_legs():
     assert order(0.996, 1.001, 0.999) == [1, 2, 0]
     assert order(0.98, 1.001, 0.999) == [0, 1, 2]
     assert order(1.0, 0.99, 0.995) == [1, 2, 0]
+
+
+def test_that_a_leg_does_as_the_other_one_is_no_reason_to_win():
+    """An animal may be lame: the picture decides."""
+    first = {"gait": "walk", "limbs": "on their own"}
+    losses = torch.tensor([1.0, 1.001])
+    assert torch.equal(preferences.alike([first, first | {"alike": "as the other side's"}], losses, "alike"), losses)
+
+
+def walking(*fitted: str) -> np.ndarray:
+    """Front paws are up by turns; those on the sides `fitted` all the time."""
+    swings = {side: [k * STRIDE + n for k in range(4) for n in at] for side, at in SWINGS.items()}
+    return up(*((side, np.arange(T) if side in fitted else np.array(swings[side])) for side in SWINGS))
+
+
+def as_the_other(seen: np.ndarray, fitted: np.ndarray, frequencies=(FPS / STRIDE,)) -> dict[str, np.ndarray] | None:
+    """(T,) degrees of both elbows when a leg that never comes down has done as the other one."""
+    problem, _, x, guess = of(seen, fitted)
+    found = alike.as_the_other(problem, x, guess, clock=CLOCK, frequencies=frequencies)
+    number = problem.kin.skeleton.names.index
+    elbows = {side: number(f"front_{side}_elbow") for side in SWINGS}
+    return None if found is None else {s: np.degrees(found[1].q[0, :, j, 1].numpy()) for s, j in elbows.items()}
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_a_leg_that_never_comes_down_does_as_the_other_one_at_its_own_time(side):
+    """Of the leg on the far side the picture shows the swings only."""
+    elbow = as_the_other(walking(), walking(side))
+    assert elbow is not None
+    for own, at in SWINGS.items():
+        middle = np.array([k * STRIDE + at[1] for k in range(1, 4)])
+        assert (elbow[own][middle] < -60).all(), own
+        assert (elbow[own][middle[:-1] + STRIDE // 2] > -35).all(), own
+
+
+def test_legs_that_come_down_and_pairs_of_which_none_does_stay_as_they_are():
+    assert as_the_other(walking(), walking()) is None
+    assert as_the_other(walking(), walking("left", "right")) is None
+
+
+def test_without_a_period_no_leg_does_as_the_other_one():
+    assert as_the_other(walking(), walking("right"), frequencies=()) is None
+
+
+@pytest.mark.parametrize("key", ["limbs", "alike"])
+def test_a_leg_that_never_comes_down_is_tried_as_the_other_one_twice(key: str):
+    label = {"gait": "walk", "stride_hz": FPS / STRIDE}
+    problem, root, x, guess = of(walking(), walking("right"))
+    root = replace(root, travelled=3.0)
+    effort = fit.Effort((Schedule(1, 2, 8, ()),) * len(fit.PHASES), 1, 1)
+    step, before = {"limbs": (fit._to_limbs, fit.FINAL), "alike": (fit._to_alike, fit.LIMBS)}[key]
+    run = Run(before, x, guess, [label], {fit.PHASES[before]: [{}]})
+    after = step(problem, run, rank(problem, x, guess), root, effort)
+    assert label | {key: "as the other side's"} in after.labels
+    assert fit.PHASES[after.phase] == key
 
 
 def test_without_two_strides_nothing_is_borrowed():

@@ -9,6 +9,7 @@ Tensor = torch.Tensor
 STEPS = 0.04  # share by which the loss without a gait must be lower over more than a body length
 ALIKE = 0.01  # share by which the loss with strides that are alike may be higher
 _SWINGS = {"limbs", "strides", "alike"}  # keys of who does as the first one does but for some swings
+_BORROWED = {"alike", "again"}  # what they say of who does strides as others of them; not as the other side does
 
 
 def steps(labels: list[dict], losses: Tensor, root: RootGuess) -> Tensor:
@@ -19,9 +20,9 @@ def steps(labels: list[dict], losses: Tensor, root: RootGuess) -> Tensor:
 
 
 def alike(labels: list[dict], losses: Tensor, key: str) -> Tensor:
-    """Strides are alike, which labels that have `key` say, rather than as the first one's. That tells nothing of rivals
+    """Strides are alike, which labels say under `key`, rather than as the first one's. That tells nothing of rivals
     which differ from it by more than swings, by exchanged legs, say: to them the others are as good as the best."""
-    favoured = losses * torch.tensor([1 - ALIKE * (key in label) for label in labels])
+    favoured = losses * torch.tensor([1 - ALIKE * (label.get(key) in _BORROWED) for label in labels])
     differ = [{k for k in label.keys() | labels[0].keys() if label.get(k) != labels[0].get(k)} for label in labels]
     beside = torch.tensor([keys <= _SWINGS for keys in differ])
     return torch.where(beside, favoured - favoured[beside].min() + losses[beside].min(), losses)
