@@ -126,6 +126,21 @@ def test_a_wrong_device_is_told_of_before_anything_begins(tmp_path, monkeypatch:
     assert "no device" not in call("--quality", "draft").stderr
 
 
+def test_a_whole_run_needs_a_device_only_for_a_clip_whose_fields_are_fitted(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv(VARIABLE, "gpu")
+    (tmp_path / "clip.mp4").write_text("no clip")
+    (tmp_path / "points.npz").write_text("no key points")
+
+    def told(name: str, *more: str) -> bool:
+        project = tmp_path / "-".join(("of", name, *more))
+        call = ["--project", str(project), "run", str(tmp_path / name), "--robot", "go1", *more]
+        return "no device 'gpu'" in CliRunner().invoke(app, call).stderr
+
+    assert told("clip.mp4")
+    assert not told("clip.mp4", "--quality", "draft")
+    assert not told("points.npz")
+
+
 def test_a_gpu_with_too_little_memory_is_no_crash(fitted, monkeypatch: pytest.MonkeyPatch):
     def full(*_, **__):
         raise torch.OutOfMemoryError("CUDA out of memory")

@@ -14,7 +14,7 @@ from slomo.errors import InvalidData, UsageError
 from slomo.motion import KeypointMotion
 from slomo.pinhole import Intrinsics
 from slomo.reconstruct import fit, gaits, hypotheses, observations, silhouette
-from slomo.reconstruct.fit_stage import run_fit
+from slomo.reconstruct.fit_stage import _effort, run_fit
 from slomo.reconstruct.hypotheses import GaitHypothesis
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.observations import observe
@@ -134,6 +134,15 @@ class _Watched(Silent):
 
     def update(self, fraction: float, message: str = "") -> None:
         self.done.append(fraction)
+
+
+@pytest.mark.parametrize("travelled", [0.8, 3.0])
+def test_the_work_that_is_expected_has_every_phase_that_may_come(travelled: float):
+    """Who strides on the spot gets alike strides as well; legs that overtake are of who travels."""
+    effort = _effort(QUICK)
+    root = hypotheses.RootGuess(np.zeros((2, 2)), 1.0, np.zeros(2), travelled, np.zeros(2))
+    work = [fit._work(s) for s in effort.schedules]
+    assert fit._expected(effort, root) == pytest.approx(sum(work) - (travelled < 1) * work[-1])
 
 
 def test_a_walk_is_found(walk):

@@ -70,6 +70,8 @@ def test_a_bone_that_is_not_the_skeletons_is_told_of_but_for_tails():
     assert (changed > 1.3).sum() == 2  # it and the right one
     assert changed.max() < np.exp(3.0 * NODE_SPREAD)  # less, the shorter it is
     assert changed.min() == pytest.approx(1.0)
+    shape["node"][0, [node["hind_left_hock"], node["tail_base"]]] = torch.tensor([0.0, 6.0])
+    assert stretch(kin, shape).max() > 1.3  # where the tail begins is of the trunk
 
 
 def test_bones_keep_their_lengths(kin: Kinematics):

@@ -81,6 +81,28 @@ def test_the_lowest_overlap_is_that_of_a_while_and_not_of_one_frame():
     assert at == pytest.approx(34 / 30)
 
 
+def test_frames_of_which_nothing_is_known_make_no_while_of_one_frame():
+    """Who leaves the picture, say, and comes back after more than a while."""
+    t, iou = np.arange(90) / 30, np.full(90, 0.9)
+    iou[30], iou[31:60] = 0.5, np.nan
+    low, at = lowest(iou, t)
+    assert low == pytest.approx(0.9 - 0.4 / 5)  # with the four before it, half of a while
+    assert at == pytest.approx(28 / 30)
+    assert np.isnan(lowest(np.full(90, np.nan), t)).all()
+
+
+def test_the_end_of_a_clip_counts_as_its_beginning_does():
+    t, iou = np.arange(60) / 30, np.full(60, 0.9)
+    iou[-9:] = 0.6
+    assert lowest(iou, t)[0] == pytest.approx(0.6)
+    assert lowest(iou[::-1], t)[0] == pytest.approx(0.6)
+
+
+def test_a_low_overlap_all_the_time_does_not_count_twice():
+    found = {c.name: c.level for c in checks(_with(report=dict(silhouette_iou=0.6, silhouette_iou_low=0.5)))}
+    assert (found["silhouette_iou"], found["silhouette_iou_low"]) == ("poor", "unknown")
+
+
 def test_the_lowest_overlap_of_a_short_clip_is_that_of_all_its_frames():
     low, at = lowest(np.array([0.8, 0.6, np.nan, 0.7]), np.arange(4) / 30)
     assert low == pytest.approx(0.7)

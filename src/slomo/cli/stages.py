@@ -27,6 +27,7 @@ from slomo.cli.options import (
 from slomo.cli.session import RobotOption, Session, command
 from slomo.cli.subject import AtOption, BoxOption, chosen_subject
 from slomo.errors import UsageError
+from slomo.pipeline import Project
 
 KEYPOINT_SUFFIXES = (".json", ".npz")
 BUILT_IN_SKELETONS = ("auto", "quadruped", "human")
@@ -70,6 +71,18 @@ def _evidence(
     if both[0] != both[1]:
         raise UsageError(f"needs --keypoint-{'map' if both[0] else 'model'} too", where="--keypoint-model")
     return {"evidence": evidence, "inputs": inputs}
+
+
+def _device_there(project: Project, stage: str) -> None:
+    """A device that is not there is told of now and not after minutes, when the fields begin, where `stage` needs them.
+
+    Raises:
+        UsageError: of `SLOMO_DEVICE`.
+    """
+    if os.environ.get("SLOMO_DEVICE") and "reconstruct" in project.chain(stage):
+        from slomo.reconstruct.refine_stage import device_of
+
+        device_of(project.config("reconstruct"))
 
 
 def _from_clip(
@@ -144,10 +157,7 @@ def add_commands(app: typer.Typer) -> None:
         if clip is not None:
             changes["inputs"] |= {"clip": session.user_path(clip, "clip")} | session.choice_reopened("clip")
         project = session.configure(changes)
-        if os.environ.get("SLOMO_DEVICE"):  # a wrong one would be told of after minutes, when the fields begin
-            from slomo.reconstruct.refine_stage import device_of
-
-            device_of(project.config("reconstruct"))
+        _device_there(project, "reconstruct")
         session.emit_artifact(session.runner(project).make("reconstruct"))
 
     @command(app, "import", runs=True)
@@ -275,10 +285,6 @@ def add_commands(app: typer.Typer) -> None:
         slomo run two.mp4 --robot go1 --subject-box 500,200,800,420
         slomo run keypoints.npz --robot go1
         """
-        if os.environ.get("SLOMO_DEVICE"):  # wrong, it would be told of after minutes, when the fields begin
-            from slomo.reconstruct.fields.device import find
-
-            find(large=True)
         evidence = _evidence(session, prior, keypoints2d, keypoint_model, keypoint_map)
         who = chosen_subject(segmenter, subject_at, subject_box)
         changes = _from_clip(session, skeleton, who, masks, weights, start, duration, length, quality, fov, evidence)
@@ -289,5 +295,6 @@ def add_commands(app: typer.Typer) -> None:
             inputs[role] = session.user_path(source, role)
             both = session.given("clip" if role == "keypoints" else "keypoints")
             inputs["motion"] = None if not both else "import" if role == "keypoints" else "reconstruct"
-        project = session.configure(changes, robot)
-        session.emit_artifact(session.runner(project).make("track" if no_video else "report"))
+        project, last = session.configure(changes, robot), "track" if no_video else "report"
+        _device_there(project, last)
+        session.emit_artifact(session.runner(project).make(last))

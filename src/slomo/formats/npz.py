@@ -1,6 +1,7 @@
 """NumPy archives without pickle."""
 
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -13,5 +14,5 @@ def load(path: Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as z:
             return {k: z[k] for k in z.files}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as e:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as e:
         raise InvalidData(f"is not a readable .npz archive ({e})", where=path, todo="make it again") from None

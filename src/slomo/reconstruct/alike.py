@@ -1,4 +1,5 @@
-"""Strides that are alike: when a leg swings that is hidden for a while the picture does not say, other strides do.
+"""Strides that are alike: when a leg swings that is hidden for a while the picture does not say, other strides do, or
+the other leg of the pair.
 
 A gallop's far front leg passes behind the near one, and a fit that has it swing too early there is as good by the
 picture as the right one. Where the leg is seen, in the next stride, it is not: laid over the strides that show the leg
@@ -73,14 +74,14 @@ def as_the_other(
     x, guess = as_guess(problem, x, guess)
     height = np.quantile(sides.feet(problem, x, guess)[0, :, :, 2].numpy() - kin.skeleton.sole, LOW, axis=0)
     limbs = [limb_links(kin.skeleton, limb) for limb in kin.skeleton.limbs]
-    lost = [(a, b) for pair in kin.pairs.tolist() for a, b in (pair, pair[::-1]) if height[b] < ALOFT < height[a]]
+    lost = [a for pair in kin.pairs.tolist() for a, b in (pair, pair[::-1]) if height[b] < ALOFT < height[a]]
     q = guess.q[0].numpy().astype(float)
     stand = sorted({j for n, chain in enumerate(limbs) if height[n] < ALOFT for j in chain})
     period = _period(q[:, stand, 1], clock, frequencies) if lost else None
     if period is None:
         return None
     mirrored, at = kin.mirrored(guess.q)[0].numpy(), problem.obs.at.numpy()
-    for leg, _ in lost:
+    for leg in lost:
         own = mirrored[:, limbs[leg]]
         then = clock[:, None] - period * np.arange(_LAGS) / _LAGS
         then = np.where(then < clock[0], then + period, then)

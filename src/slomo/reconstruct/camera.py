@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from slomo.reconstruct import certainty, rotation_ba, sfm
 from slomo.reconstruct.camera_world import GUESSED_SCALE, CameraPath, moving, turning
-from slomo.reconstruct.tracked_path import Epipolar, track_path
+from slomo.reconstruct.tracked_path import IN_FRONT, Epipolar, track_path
 from slomo.reconstruct.tracks import Tracks, background_tracks
 
 Pairs = tuple[np.ndarray, np.ndarray, np.ndarray]  # of correspondences, see Tracks.pairs
@@ -27,7 +27,6 @@ _LEAST_SHARED = 8  # corners that two frames must have in common for the turn be
 _MOST_KEYS = 120  # key frames that are enough for any clip, as long as none is farther from the next than this:
 _KEY_GAP = 0.5  # s
 _MOST_GUESSED = 0.05  # part of the frames whose camera may be interpolated without a word
-_IN_FRONT = 0.97  # part of the tracks' sightings whose points must lie before the camera, for a path to be used
 _AGREES = 1.3  # of its epipolar cost, up to which bundle adjustment with other corners has kept it
 _MOST_PAIRS = 24_000  # correspondences for a turning camera, drawn from those there are
 
@@ -81,7 +80,7 @@ def estimate_camera(
     report |= {"parallax_px": parallax, "parallax_limit_px": limit}
     progress.update(0.2, f"residual of a turning camera {parallax:.2f} px")
     if parallax > limit:
-        turned = fit  # the path is sought with the focal length that is set
+        turned = fit  # the search for the path begins with the focal length that is set
         if fit.focal != settings.focal:
             turned = _fit_turning(pairs, len(keys), center, replace(settings, refine_focal=False))
         structure = _structure(frames, masks, t, tracks, shown, turned.R_world_cam, settings, report, progress)
@@ -210,7 +209,7 @@ def _structure(
         refine = s.refine_focal
         path = track_path(epipolar, tracks, keys, center, s.focal, s.seed, turning_R, refine_focal=refine)
     if path is not None:
-        if path.in_front > _IN_FRONT and (structure := solve(keys, path.focal, path.T_world_cam)):
+        if path.in_front > IN_FRONT and (structure := solve(keys, path.focal, path.T_world_cam)):
             explained = epipolar.cost(structure.T_world_cam, structure.focal)
             placed = structure if explained < _AGREES * path.cost else None
         if placed and path.agreed:

@@ -1,6 +1,7 @@
 """The fit, coarse to fine: size and trunk with headings, then gaits with the legs, then the rivals, then the winner,
-and that once more beside those with limbs where they are seen better, alike strides, or left and right exchanged.
-Then, only where there is something to compare it with, once more with alike strides and with legs that overtake.
+and that once more beside those with limbs where they are seen better, alike strides, a leg that does as the other
+one, or left and right exchanged. Then, only where there is something to compare it with, once more with alike strides
+and with legs that overtake.
 
 Every phase is one `optimise` of a batch of hypotheses; between phases they are ranked by loss on fixed draws and the
 best go on. All of it is deterministic by the seed, and a checkpoint within any phase resumes to the same bits.
@@ -109,7 +110,7 @@ def _work(schedule: Schedule) -> float:
 
 def _expected(effort: Effort, root: RootGuess) -> float:
     """The work of all phases that the clip may have: where some are skipped, progress leaps ahead, and never back."""
-    return sum(_work(s) for s in (effort.schedules if root.travelled > 1 else effort.schedules[: LIMBS + 1]))
+    return sum(_work(s) for s in (effort.schedules if root.travelled > 1 else effort.schedules[:-1]))
 
 
 def _to_gait(
@@ -199,8 +200,9 @@ def _front_or_back(run: Run) -> bool:
 
 def _to_limbs(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, *_) -> Run:
     """The best one goes on, beside it with limbs that are where they are seen better by now, where any are and there is
-    time for it, and with a pair of legs exchanged where that is hardly worse; of a person who stays in place turned
-    around once more, and with limbs kept apart that change places."""
+    time for it, with a leg that does as the other one of its pair, and with a pair of legs exchanged where that is
+    hardly worse; of a person who stays in place turned around once more, and with limbs kept apart that change places.
+    """
     best = _winner(run, preferences.steps(run.labels, losses, root))
     rivals = [(best.x, best.guess)]
     labels = list(best.labels)
@@ -238,7 +240,8 @@ def _borrowed(
 
 
 def _to_alike(problem: Problem, run: Run, losses: Tensor, root: RootGuess, effort: Effort, *_) -> Run:
-    """The best one goes on beside itself with alike strides, which show more of it once the limbs have been fitted."""
+    """The best one goes on beside itself with alike strides, which show more of it once the limbs have been fitted, and
+    with a leg that does as the other one of its pair."""
     best = _winner(run, preferences.alike(run.labels, losses, _ALIKE[run.phase]))
     rivals = []
     if effort.schedules[PHASES.index("alike")].iterations:

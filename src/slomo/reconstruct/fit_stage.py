@@ -22,7 +22,7 @@ from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import AUTO, USUAL, Skeleton, list_skeletons, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 46
+FIT_VERSION = 47
 
 AGAIN = 0.5  # share of the rates with which the winner is fitted once more, beside one with other limbs
 POLISH = 0.4  # share of the rates with which the chunks of a long clip are polished together

@@ -157,13 +157,18 @@ def _skate(feet: Array, contact: Array, t: Array) -> float:
 
 
 def lowest(iou: Array, t: Array) -> tuple[float, float]:
-    """Least mean over `WHILE` of the IoU (F,) of frames at t (F,) s, NaN left out, and the middle of that time, s. What
-    is wrong for half a second only, a raised leg that is fitted where the other one stands, hardly shows in the mean
-    over a clip."""
-    iou, t = iou[~np.isnan(iou)], t[~np.isnan(iou)]
-    spans = [(t >= start) & (t < start + WHILE) for start in t if start + WHILE <= t[-1] or start == t[0]]
-    low = min(spans, key=lambda span: iou[span].mean())
-    return float(iou[low].mean()), float(t[low].mean())
+    """Least mean over `WHILE` of the IoU (F,) of frames at t (F,) s, and the middle of that time, s, where it is known
+    of half of these frames at least; NaN where of none. What is wrong for half a second only, a raised leg that is
+    fitted where the other one stands, hardly shows in the mean over a clip."""
+    step = float(np.median(np.diff(t))) if len(t) > 1 else WHILE
+    count = min(len(t), max(1, round(WHILE / step)))
+    whiles = np.lib.stride_tricks.sliding_window_view(iou, count)
+    known = (~np.isnan(whiles)).mean(1) >= 0.5
+    if not known.any():
+        return float("nan"), float("nan")
+    mean = np.array([np.nanmean(w) if k else np.inf for w, k in zip(whiles, known, strict=True)])
+    low = int(mean.argmin())
+    return float(mean[low]), float(t[low : low + count][~np.isnan(whiles[low])].mean())
 
 
 def _overlap(problem: Problem, run: Run) -> tuple[float, Array]:
@@ -190,9 +195,8 @@ def _overlap(problem: Problem, run: Run) -> tuple[float, Array]:
         moved = losses.carry(state, torch.tensor([f]), c, X)[0, 0] - torch.stack([state.u[0], state.v[0]], -1)
         e = (moved - obs.flow[f][inside[0]]).norm(dim=-1)
         errors.append(e[obs.flow_ok[f][inside[0]] & meets[0, 0]].numpy() / obs.scale.mean())
-    return float(np.median(np.concatenate(errors))) if errors and sum(map(len, errors)) else float("nan"), np.array(
-        ious
-    )
+    error = float(np.median(np.concatenate(errors))) if errors and sum(map(len, errors)) else float("nan")
+    return error, np.array(ious)
 
 
 def _confidence(problem: Problem, body: Posed, R_cam: torch.Tensor, centre: torch.Tensor, frame_iou: Array) -> Array:

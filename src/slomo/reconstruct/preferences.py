@@ -25,4 +25,5 @@ def alike(labels: list[dict], losses: Tensor, key: str) -> Tensor:
     favoured = losses * torch.tensor([1 - ALIKE * (label.get(key) in _BORROWED) for label in labels])
     differ = [{k for k in label.keys() | labels[0].keys() if label.get(k) != labels[0].get(k)} for label in labels]
     beside = torch.tensor([keys <= _SWINGS for keys in differ])
-    return torch.where(beside, favoured - favoured[beside].min() + losses[beside].min(), losses)
+    least = lambda x: x[beside].nan_to_num(nan=torch.inf).min()  # noqa: E731
+    return torch.where(beside, favoured - least(favoured) + least(losses), losses)

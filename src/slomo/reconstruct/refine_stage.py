@@ -26,7 +26,7 @@ from slomo.reconstruct.run import Run, from_arrays
 from slomo.reconstruct.verdict import Facts, checks, verdict
 from slomo.stage import Artifact, Inputs, Progress
 
-REFINE_VERSION = 17
+REFINE_VERSION = 18
 SHORT = 0.05  # body lengths, added to bones and the skeleton's own: by how much short ones change says little
 TREMBLES = 0.1  # degrees of a camera's rotation, of which the user is told
 
@@ -151,7 +151,8 @@ def stretch(kin: Kinematics, shape: dict[str, torch.Tensor]) -> np.ndarray:
     less, and tails do not count: with a short one or a long one a body moves the same."""
     offset, rest = kin.offsets(shape)[0].norm(dim=-1), kin.offset.norm(dim=-1)
     ratio = (offset / shape["log_length"].exp()[0] + SHORT) / (rest + SHORT)
-    return ratio[torch.tensor(["tail" not in name for name in kin.skeleton.names])].numpy()
+    names = kin.skeleton.group_names
+    return ratio[torch.tensor([n < 0 or names[n] != "tail" for n in kin.skeleton.group])].numpy()
 
 
 def _mesh(

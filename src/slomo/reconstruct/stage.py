@@ -13,7 +13,7 @@ from slomo.packed import pack, unpack
 from slomo.stage import Artifact, Inputs, Progress
 
 MASKS_VERSION = 26
-CAMERA_VERSION = 10
+CAMERA_VERSION = 11
 QUALITIES = ("draft", "normal", "high")
 
 SEGMENTERS = ("auto", "u2netp", "still", "motion", "user")

@@ -23,6 +23,7 @@ _SETTLED = 0.98  # of the cost before, above which another round is of no use
 # Of the cost with the focal length that is given, below which another one is taken. A wrong one bends the path of a
 # camera that turns far, and bundle adjustment does not find back from there; elsewhere the tracks hardly tell it.
 _BETTER = 0.9
+IN_FRONT = 0.97  # part of the tracks' sightings whose points must lie before the camera, for a path to be used
 # Weight of the path's second differences, of the mean weight that the tracks give a frame's position: while rotations
 # are wrong, and when they are right.
 _SMOOTH, _SETTLED_SMOOTH = 1e-2, 1e-5
@@ -37,7 +38,7 @@ class TrackedPath:
         focal: px.
         cost: of `Epipolar.cost`.
         in_front: part of the sightings whose point lies before the camera.
-        agreed: whether another start led to the same.
+        agreed: whether another start led to the same; never where the focal length was freed, for that is one start.
     """
 
     T_world_cam: np.ndarray
@@ -148,7 +149,7 @@ def track_path(
             break
     if refine_focal:
         freed = _from(epipolar, sightings, found[0].T_world_cam[:, :3, :3], focal, free_focal=True)
-        if freed.cost < _BETTER * found[0].cost:
+        if freed.cost < _BETTER * found[0].cost and freed.in_front >= min(found[0].in_front, IN_FRONT):
             return freed
     return found[0]
 

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from slomo.errors import InvalidData
+from slomo.formats import npz
 from slomo.packed import unpack
 from slomo.reconstruct.flow import Flow
 from slomo.reconstruct.segment import Masks, Report, no_subject
@@ -69,11 +70,11 @@ def _natural(path: Path) -> tuple[list[str | int], str]:
 
 
 def _from_archive(path: Path) -> np.ndarray:
+    arrays = npz.load(path)
     try:
-        with np.load(path, allow_pickle=False) as z:
-            shape = tuple(int(n) for n in z["shape"])
-            masks = unpack(z)
-    except (OSError, ValueError, KeyError, IndexError, TypeError, EOFError) as error:
+        shape = tuple(int(n) for n in arrays["shape"])
+        masks = unpack(arrays)
+    except (ValueError, KeyError, IndexError, TypeError) as error:
         raise InvalidData(
             f"cannot be read as masks ({error})", where=path, todo="give an npz with arrays packed and shape"
         ) from None
