@@ -133,7 +133,7 @@ def test_a_whole_run_needs_a_device_only_for_a_clip_whose_fields_are_fitted(tmp_
 
     def told(name: str, *more: str) -> bool:
         project = tmp_path / "-".join(("of", name, *more))
-        call = ["--project", str(project), "run", str(tmp_path / name), "--robot", "go1", *more]
+        call = ["run", str(tmp_path / name), "--project", str(project), "--robot", "go1", *more]
         return "no device 'gpu'" in CliRunner().invoke(app, call).stderr
 
     assert told("clip.mp4")

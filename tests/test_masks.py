@@ -297,12 +297,12 @@ def test_user_masks_that_do_not_fit(tmp_path):
     with pytest.raises(InvalidData, match="holds 7 masks, the decoded clip has 10"):
         run_masks(inputs(frames, masks=tmp_path), MasksConfig(), Silent())
     (tmp_path / "a.npz").write_text("not an archive")
-    with pytest.raises(InvalidData, match="not a readable .npz"):
+    with pytest.raises(InvalidData, match="not a readable"):
         run_masks(inputs(frames, masks=tmp_path / "a.npz"), MasksConfig(), Silent())
     np.savez(tmp_path / "whole.npz", **pack(truth))
     whole = (tmp_path / "whole.npz").read_bytes()
     (tmp_path / "b.npz").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InvalidData, match="not a readable .npz"):
+    with pytest.raises(InvalidData, match="not a readable"):
         run_masks(inputs(frames, masks=tmp_path / "b.npz"), MasksConfig(), Silent())
     np.savez(tmp_path / "c.npz", masks=truth)
     with pytest.raises(InvalidData, match="cannot be read as masks"):

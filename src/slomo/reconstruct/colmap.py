@@ -71,7 +71,7 @@ def _main(folder: str) -> None:
     find = _mapped if job["path"] is None else _placed
     model, angle = find(root, database, images, job)
     if model is not None:
-        np.savez(root / "out.npz", least_angle=np.array(angle), **_arrays(model))
+        np.savez(root / "out.npz", allow_pickle=False, least_angle=np.array(angle), **_arrays(model))
 
 
 def _mapping(job: dict[str, Any], count: int, first_angle: float, angle: float):

@@ -160,6 +160,6 @@ def write_clip(out_dir: Path, config: Config, progress: Progress) -> None:
     clip = encode_mp4(frames(), config.fps, crf=config.crf, preset="slow")
     out_dir.mkdir(parents=True, exist_ok=True)
     stack = np.stack(masks)
-    np.savez_compressed(out_dir / "masks.npz", **pack(stack))
+    np.savez_compressed(out_dir / "masks.npz", allow_pickle=False, **pack(stack))
     np.savez_compressed(out_dir / "truth.npz", **arrays)
     (out_dir / "clip.mp4").write_bytes(clip)
