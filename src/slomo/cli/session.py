@@ -258,3 +258,15 @@ def command(app: typer.Typer, name: str, *, runs: bool = False) -> Callable[[Cal
         return f
 
     return register
+
+
+def device_there(project: "Project", stage: str) -> None:
+    """A device that is not there is told of now and not after minutes, when the fields begin, where `stage` needs them.
+
+    Raises:
+        UsageError: of `SLOMO_DEVICE`.
+    """
+    if os.environ.get("SLOMO_DEVICE") and "reconstruct" in project.chain(stage):
+        from slomo.reconstruct.refine_stage import device_of
+
+        device_of(project.config("reconstruct"))

@@ -1,6 +1,5 @@
 """The commands that make artifacts, from the clip to the reference, the report, and all at once."""
 
-import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,10 +23,9 @@ from slomo.cli.options import (
     TruthOption,
     WeightsOption,
 )
-from slomo.cli.session import RobotOption, Session, command
+from slomo.cli.session import RobotOption, Session, command, device_there
 from slomo.cli.subject import AtOption, BoxOption, chosen_subject
 from slomo.errors import UsageError
-from slomo.pipeline import Project
 
 KEYPOINT_SUFFIXES = (".json", ".npz")
 BUILT_IN_SKELETONS = ("auto", "quadruped", "human")
@@ -71,18 +69,6 @@ def _evidence(
     if both[0] != both[1]:
         raise UsageError(f"needs --keypoint-{'map' if both[0] else 'model'} too", where="--keypoint-model")
     return {"evidence": evidence, "inputs": inputs}
-
-
-def _device_there(project: Project, stage: str) -> None:
-    """A device that is not there is told of now and not after minutes, when the fields begin, where `stage` needs them.
-
-    Raises:
-        UsageError: of `SLOMO_DEVICE`.
-    """
-    if os.environ.get("SLOMO_DEVICE") and "reconstruct" in project.chain(stage):
-        from slomo.reconstruct.refine_stage import device_of
-
-        device_of(project.config("reconstruct"))
 
 
 def _from_clip(
@@ -157,7 +143,7 @@ def add_commands(app: typer.Typer) -> None:
         if clip is not None:
             changes["inputs"] |= {"clip": session.user_path(clip, "clip")} | session.choice_reopened("clip")
         project = session.configure(changes)
-        _device_there(project, "reconstruct")
+        device_there(project, "reconstruct")
         session.emit_artifact(session.runner(project).make("reconstruct"))
 
     @command(app, "import", runs=True)
@@ -296,5 +282,5 @@ def add_commands(app: typer.Typer) -> None:
             both = session.given("clip" if role == "keypoints" else "keypoints")
             inputs["motion"] = None if not both else "import" if role == "keypoints" else "reconstruct"
         project, last = session.configure(changes, robot), "track" if no_video else "report"
-        _device_there(project, last)
+        device_there(project, last)
         session.emit_artifact(session.runner(project).make(last))
