@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slomo.packed import pack
+from slomo.packed import pack, unpack
 from slomo.reconstruct import decode_stage
 from slomo.reconstruct.flow import dense_flow
 from slomo.reconstruct.subject_flow import closer, merged
@@ -33,7 +33,7 @@ def main() -> None:
         with np.load(folder / "truth.npz") as z:
             truth = dict(z)
         with np.load(folder / "masks.npz") as z:
-            masks = np.unpackbits(z["packed"], axis=-1)[..., : z["shape"][2]].astype(bool)
+            masks = unpack(z)
         frames = decode(folder / "clip.mp4", enlarge=decode_stage.Config().enlarge).frames
         if frames.shape[:3] != masks.shape:
             raise SystemExit(f"{folder}: masks of another size than the frames that are decoded")
