@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from slomo.errors import UsageError
 from slomo.packed import pack
 from slomo.reconstruct import decode_stage
-from slomo.reconstruct.camera import CameraSettings, estimate_camera
+from slomo.reconstruct.camera import estimate_camera
+from slomo.reconstruct.camera_world import CameraSettings
 from slomo.reconstruct.ground import find_ground, gravity_from_lines
 from slomo.reconstruct.resection import interpolate_poses
 from slomo.reconstruct.stage import CameraConfig, run_camera

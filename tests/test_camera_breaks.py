@@ -146,9 +146,9 @@ def test_no_path_from_tracks_that_are_in_two_key_frames_only():
     tracks, keys = Tracks(frame, track, rng.uniform(0, 200, (80, 2))), np.arange(3)
     epipolar = Epipolar(tracks, keys, (1,), CENTER, 0)
     assert epipolar.least_shared == 20
-    assert (
-        track_path(epipolar, tracks, keys, CENTER, 300.0, 0, np.tile(np.eye(3), (3, 1, 1)), refine_focal=True) is None
-    )
+    still = np.tile(np.eye(3), (3, 1, 1))
+    freed = rotation_ba.RotationFit(still, 300.0, np.inf, np.zeros(0))
+    assert track_path(epipolar, tracks, keys, CENTER, 300.0, 0, still, freed=freed) == []
 
 
 @pytest.mark.parametrize("every", [44, 1000])

@@ -10,7 +10,8 @@ import safetensors.numpy
 from scipy.spatial.transform import Rotation
 
 from slomo.reconstruct import certainty, resection, scale_breaks, sfm
-from slomo.reconstruct.camera import _key_frames, estimate_camera
+from slomo.reconstruct.camera import estimate_camera
+from slomo.reconstruct.moving_camera import key_frames
 from slomo.reconstruct.tracks import Tracks
 from slomo.stage import Silent
 from test_camera import pan, settings, texture, turned_views
@@ -101,7 +102,7 @@ def test_certainty_of_a_plane_is_its_spread_over_draws():
 @pytest.mark.parametrize(("seconds", "fps", "most"), [(3, 30, 31), (20, 30, 121), (60, 15, 151), (600, 12, 1201)])
 def test_key_frames_are_bounded_and_near_each_other(seconds, fps, most):
     t = np.arange(seconds * fps) / fps
-    keys, gaps = _key_frames(t, np.arange(len(t)), 3)
+    keys, gaps = key_frames(t, np.arange(len(t)), 3)
     assert keys[0] == 0
     assert keys[-1] == len(t) - 1
     assert len(keys) <= most

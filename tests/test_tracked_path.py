@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from slomo.reconstruct import rotation_ba
-from slomo.reconstruct.tracked_path import Epipolar, track_path
+from slomo.reconstruct.tracked_path import Epipolar, TrackedPath, track_path
 from slomo.reconstruct.tracks import Tracks
 
 FOCAL, CENTER = 500.0, np.array([239.5, 134.5])
@@ -81,12 +81,19 @@ def path_of(R: np.ndarray, tracks: Tracks, focal: float, *, refine_focal: bool):
     keys, gaps = np.arange(len(R)), (1, 3, 8, 16)
     epipolar = Epipolar(tracks, keys, gaps, CENTER, 0)
     assert epipolar.least_shared > 20
-    turning = rotation_ba.fit_rotations(
-        *tracks.pairs(gaps, keys), len(keys), center=CENTER, focal=focal, refine_focal=False
+    turning, freed = (
+        rotation_ba.fit_rotations(*tracks.pairs(gaps, keys), len(keys), center=CENTER, focal=focal, refine_focal=free)
+        for free in (False, True)
     )
-    path = track_path(epipolar, tracks, keys, CENTER, focal, 0, turning.R_world_cam, refine_focal=refine_focal)
+    free = freed if refine_focal else None
+    path = track_path(epipolar, tracks, keys, CENTER, focal, 0, turning.R_world_cam, freed=free)[0]
+    return path, off_by(path, R), epipolar
+
+
+def off_by(path: TrackedPath, R: np.ndarray) -> float:
+    """Degrees."""
     turned = Rotation.from_matrix(path.T_world_cam[:, :3, :3]) * Rotation.from_matrix(R[0].T @ R).inv()
-    return path, float(np.degrees(turned.magnitude()).max()), epipolar
+    return float(np.degrees(turned.magnitude()).max())
 
 
 @pytest.mark.parametrize(("seed", "degrees"), [(0, 14.0), (1, -8.0), (2, 40.0)])
@@ -120,3 +127,40 @@ def test_a_focal_length_that_tracks_hardly_tell_is_kept():
     R, _, tracks = retreating(1, -8.0)
     path, _, _ = path_of(R, tracks, 1.2 * FOCAL, refine_focal=True)
     assert path.focal == 1.2 * FOCAL
+
+
+def turning_about(degrees: float, travel: float):
+    """A camera that turns by `degrees` and travels next to nothing, among things all around: R (T, 3, 3), tracks."""
+    rng, T, N = np.random.default_rng(0), 40, 3000
+    along = np.linspace(0, 1, T)
+    p = travel * np.column_stack([along, 0.1 * np.sin(7 * along), 0.3 * np.sin(5 * along)])
+    R = Rotation.from_euler("yx", np.column_stack([degrees * along, -8 + 1.5 * np.sin(8 * along)]), degrees=True)
+    angle, away = np.radians(rng.uniform(-40, degrees + 40, N)), rng.uniform(4, 16, N)
+    height = np.where(rng.random(N) < 0.6, 1.4, rng.uniform(-2, 1.4, N))
+    things = np.column_stack([away * np.sin(angle), height, away * np.cos(angle)])
+    rows = []
+    for t in range(T):
+        X = (things - p[t]) @ R[t].as_matrix()
+        uv = FOCAL * X[:, :2] / X[:, 2:] + CENTER + rng.normal(0, 0.05, (N, 2))
+        seen = np.flatnonzero((X[:, 2] > 0.2) & (uv >= 0).all(-1) & (uv < [480, 270]).all(-1))
+        rows.append((np.full(len(seen), t), seen, uv[seen]))
+    return R.as_matrix(), Tracks(*(np.concatenate(column) for column in zip(*rows, strict=True)))
+
+
+def test_a_camera_that_hardly_travels_is_also_sought_with_a_focal_length_of_its_own():
+    """A focal length that is wrong by 8 % bends its path; which path is right, bundle adjustment will tell."""
+    R, tracks = turning_about(110.0, 0.1)
+    keys, gaps = np.arange(len(R)), (1, 3, 8, 16)
+    epipolar = Epipolar(tracks, keys, gaps, CENTER, 0)
+    turning, freed = (
+        rotation_ba.fit_rotations(
+            *tracks.pairs(gaps, keys), len(keys), center=CENTER, focal=0.92 * FOCAL, refine_focal=free
+        )
+        for free in (False, True)
+    )
+    paths = track_path(epipolar, tracks, keys, CENTER, 0.92 * FOCAL, 0, turning.R_world_cam, freed=freed)
+    bent, right = sorted(paths, key=lambda path: abs(path.focal - FOCAL), reverse=True)
+    assert bent.focal == 0.92 * FOCAL
+    assert off_by(bent, R) > 3.0
+    assert off_by(right, R) < 1.0
+    assert right.focal == pytest.approx(FOCAL, rel=0.01)

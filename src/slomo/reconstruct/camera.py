@@ -5,43 +5,25 @@
 - "moving": there is parallax; structure from motion.
 """
 
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation, Slerp
 
-from slomo.reconstruct import certainty, rotation_ba, sfm
-from slomo.reconstruct.camera_world import GUESSED_SCALE, CameraPath, moving, turning
-from slomo.reconstruct.tracked_path import IN_FRONT, Epipolar, track_path
+from slomo.reconstruct import certainty, rotation_ba
+from slomo.reconstruct.camera_world import GUESSED_SCALE, CameraPath, CameraSettings, moving, turning
+from slomo.reconstruct.moving_camera import LEAST_CORNERS, find_structure, key_frames
 from slomo.reconstruct.tracks import Tracks, background_tracks
 
 Pairs = tuple[np.ndarray, np.ndarray, np.ndarray]  # of correspondences, see Tracks.pairs
 
 _STATIC_PX = 0.7  # px, background displacement below which a camera stands still (at 640 px; noise of the tracks)
 _PARALLAX_PX = 0.5  # px, residual of the turning camera over a second and more, above which there is parallax
-_LEAST_CORNERS = 12  # in a frame, in the median, below which the background says nothing about the camera
 _LEAST_SHARED = 8  # corners that two frames must have in common for the turn between them to be known
-_MOST_KEYS = 120  # key frames that are enough for any clip, as long as none is farther from the next than this:
-_KEY_GAP = 0.5  # s
 _MOST_GUESSED = 0.05  # part of the frames whose camera may be interpolated without a word
-_AGREES = 1.3  # of its epipolar cost, up to which bundle adjustment with other corners has kept it
 _MOST_PAIRS = 24_000  # correspondences for a turning camera, drawn from those there are
-
-
-@dataclass(frozen=True)
-class CameraSettings:
-    """What the stage's configuration says, in px of the decoded frames. See `CameraConfig`."""
-
-    focal: float
-    focal_std: float
-    refine_focal: bool
-    key_every: int
-    features: int
-    overlap: int
-    seed: int
 
 
 def estimate_camera(
@@ -53,7 +35,7 @@ def estimate_camera(
     tracks = background_tracks(frames, masks, progress=lambda f: progress.update(0.15 * f, "tracking the background"))
     corners = _corners(tracks, len(frames))
     report: dict[str, Any] = {"background_corners": int(np.median(corners)), "fallback": None}
-    if report["background_corners"] < _LEAST_CORNERS:
+    if report["background_corners"] < LEAST_CORNERS:
         report |= {"mode": "static", "fallback": "the background shows too few corners to follow"}
         report |= {"reprojection_error_px": None, "focal_observed": False}
         progress.note("camera: taken as static, because the background shows too few corners to follow")
@@ -62,7 +44,7 @@ def estimate_camera(
         )
 
     shown = np.flatnonzero(corners >= _LEAST_SHARED)
-    keys, gaps = _key_frames(t, shown, settings.key_every)
+    keys, gaps = key_frames(t, shown, settings.key_every)
     pairs = tracks.pairs(gaps, keys)
     breaks = _breaks(pairs[0], t[keys])
     report["background_motion_px"] = motion = _background_motion(tracks, shown)
@@ -80,10 +62,10 @@ def estimate_camera(
     report |= {"parallax_px": parallax, "parallax_limit_px": limit}
     progress.update(0.2, f"residual of a turning camera {parallax:.2f} px")
     if parallax > limit:
-        turned = fit  # the search for the path begins with the focal length that is set
+        turned = fit  # of the focal length that is set, with which the search for the path begins
         if fit.focal != settings.focal:
             turned = _fit_turning(pairs, len(keys), center, replace(settings, refine_focal=False))
-        structure = _structure(frames, masks, t, tracks, shown, turned.R_world_cam, settings, report, progress)
+        structure = find_structure(frames, masks, t, tracks, shown, turned, fit, settings, report, progress)
         if structure is not None:
             progress.note(
                 f"camera: moving (structure from motion, {len(structure.frames)} of {report['key_frames']} key frames, "
@@ -145,94 +127,6 @@ def _corners(tracks: Tracks, T: int) -> np.ndarray:
     """(T,) corners followed in each frame; those seen in one frame only do not count."""
     long = np.bincount(tracks.track)[tracks.track] > 1 if len(tracks.track) else np.zeros(0, bool)
     return np.bincount(tracks.frame[long], minlength=T)
-
-
-def _key_frames(
-    t: np.ndarray, shown: np.ndarray, every: int, most: int = _MOST_KEYS
-) -> tuple[np.ndarray, tuple[int, ...]]:
-    """Key frames of frames at t (T,) s: each n-th, sparser where there would be very many, or the nearest of those in
-    which the background is `shown` (F,); and the gaps between them, counted in key frames, over which tracks are
-    compared: from one to the next up to two seconds."""
-    step = float(t[1] - t[0])
-    every = max(every, min(-(-len(t) // most), int(_KEY_GAP / step)))
-    second = max(1, round(1.0 / step / every))
-    gaps = tuple(sorted({1, 3, max(1, second // 2), second, 2 * second}))
-    wanted = np.array(sorted({*range(0, len(t), every), len(t) - 1}))
-    return np.unique(shown[np.searchsorted((shown[1:] + shown[:-1]) / 2, wanted)]), gaps
-
-
-def _structure(
-    frames,
-    masks,
-    t,
-    tracks: Tracks,
-    shown: np.ndarray,
-    turning_R: np.ndarray,
-    s: CameraSettings,
-    report: dict[str, Any],
-    progress,
-) -> sfm.Structure | None:
-    """Structure from motion of the key frames: from the path that the tracks give, and where that is in doubt, from a
-    pair of frames too, once more with twice as many of them where they were thinned: what explains the tracks better.
-    None when too few are placed. The report says how many, and which it is. A structure is kept in a checkpoint."""
-    if (saved := progress.load()) is not None:
-        structure = sfm.Structure.of(saved)
-        report |= {"key_frames": int(saved["key_frames"]), "key_frames_registered": len(structure.frames)}
-        report["structure_start"] = "tracks" if saved["from_tracks"] else "pair"
-        return structure
-    h, w = frames.shape[1:3]
-    center = np.array([(w - 1) / 2, (h - 1) / 2])
-    keys, gaps = _key_frames(t, shown, s.key_every)
-
-    def solve(keys: np.ndarray, focal: float, path: np.ndarray | None = None) -> sfm.Structure | None:
-        return sfm.reconstruct_structure(
-            frames,
-            masks,
-            keys,
-            focal=focal,
-            refine_focal=s.refine_focal,
-            features=s.features,
-            overlap=s.overlap,
-            seed=s.seed,
-            path=path,
-            waiting=partial(_waiting, progress, 1.5 * len(keys)),
-        )
-
-    def done(structure: sfm.Structure, keys: np.ndarray, start: str) -> sfm.Structure:
-        report.update(key_frames=len(keys), key_frames_registered=len(structure.frames), structure_start=start)
-        more = {"key_frames": np.array(len(keys)), "from_tracks": np.array(start == "tracks")}
-        progress.save(structure.arrays() | more)
-        return structure
-
-    placed, explained, path = None, np.inf, None
-    if (epipolar := Epipolar(tracks, keys, gaps, center, s.seed)).least_shared >= _LEAST_CORNERS:
-        refine = s.refine_focal
-        path = track_path(epipolar, tracks, keys, center, s.focal, s.seed, turning_R, refine_focal=refine)
-    if path is not None:
-        if path.in_front > IN_FRONT and (structure := solve(keys, path.focal, path.T_world_cam)):
-            explained = epipolar.cost(structure.T_world_cam, structure.focal)
-            placed = structure if explained < _AGREES * path.cost else None
-        if placed and path.agreed:
-            return done(placed, keys, "tracks")
-    tried = 0
-    for most in (_MOST_KEYS, 2 * _MOST_KEYS):
-        more, _ = _key_frames(t, shown, s.key_every, most)
-        if len(more) == tried:
-            break
-        tried = len(more)
-        mapped = solve(more, s.focal)
-        report |= {"key_frames": tried, "key_frames_registered": 0 if mapped is None else len(mapped.frames)}
-        if mapped is not None and len(mapped.frames) >= sfm.ENOUGH * tried:
-            compared = Epipolar(tracks, mapped.frames, gaps, center, s.seed)
-            if explained < compared.cost(mapped.T_world_cam, mapped.focal) and placed:
-                break
-            return done(mapped, more, "pair")
-    return done(placed, keys, "tracks") if placed else None
-
-
-def _waiting(progress, usual: float, took: float) -> None:
-    """The share of structure from motion's work that is done can only be guessed, from the s that it takes usually."""
-    progress.update(0.2 + 0.6 * took / (took + usual), "structure from motion")
 
 
 def _background_motion(tracks: Tracks, shown: np.ndarray) -> float:

@@ -18,6 +18,19 @@ GUESSED_SCALE = "guessed camera height set to 1"
 
 
 @dataclass(frozen=True)
+class CameraSettings:
+    """What the stage's configuration says, in px of the decoded frames. See `CameraConfig`."""
+
+    focal: float
+    focal_std: float
+    refine_focal: bool
+    key_every: int
+    features: int
+    overlap: int
+    seed: int
+
+
+@dataclass(frozen=True)
 class CameraPath:
     """K (3, 3) px and T_world_cam (T, 4, 4), world z up, ground z = 0, mean camera height 1, and the report."""
 

@@ -1,6 +1,7 @@
 """What runs COLMAP: `python -m slomo.reconstruct.colmap DIR`, on the images, masks and job.json that `sfm` puts there.
 
-Leaves out.npz, or nothing where there is no model. Must not import OpenCV, which does not load beside pycolmap.
+Leaves out.npz, or nothing where there is no model; and the features and matches, which the next job finds. Must not
+import OpenCV, which does not load beside pycolmap.
 """
 
 import json
@@ -29,10 +30,10 @@ _MAX_SECONDS, _MAX_SECONDS_EACH = 180, 8.0  # at least, and for each key frame
 
 
 def _end_with(parent: int, folder: str) -> None:
-    """End this process when its parent has gone, even by SIGKILL, and tidy up in its place."""
+    """End this process when its parent has gone, even by SIGKILL, and tidy up in its place: the whole workspace."""
     while os.getppid() == parent:
         time.sleep(0.5)
-    shutil.rmtree(folder, ignore_errors=True)
+    shutil.rmtree(Path(folder).parent, ignore_errors=True)
     os._exit(1)
 
 
@@ -43,7 +44,22 @@ def _main(folder: str) -> None:
     pycolmap.logging.minloglevel = 2
     pycolmap.set_random_seed(job["seed"])
     database, images = root / "database.db", root / "images"
+    if not (root / "matched").exists():
+        _match(root, database, images, job)
+        (root / "matched").touch()
+    with pycolmap.Database.open(database) as db:
+        camera = db.read_all_cameras()[0]
+        camera.params = [job["focal"], *job["center"]]
+        db.update_camera(camera)
+    find = _mapped if job["path"] is None else _placed
+    model, angle = find(root, database, images, job)
+    if model is not None:
+        np.savez(root / "out.npz", allow_pickle=False, least_angle=np.array(angle), **_arrays(model))
 
+
+def _match(root: Path, database: Path, images: Path, job: dict[str, Any]) -> None:
+    """Features of the pictures and their matches, into the database."""
+    database.unlink(missing_ok=True)  # of a process that crashed
     reader = pycolmap.ImageReaderOptions()
     reader.mask_path = str(root / "masks")
     reader.camera_model = "SIMPLE_PINHOLE"
@@ -54,24 +70,21 @@ def _main(folder: str) -> None:
         reader.camera_params = ",".join(map(str, [job["focal"], *job["center"]]))
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = job["features"]
-    # Each picture is looked at by itself, so that what is found does not depend on the threads.
+    # Each picture is looked at by itself, so that what is found does not depend on the threads; its number would, by
+    # which everything after is ordered, were the pictures not entered before.
     extraction.num_threads, extraction.use_gpu = cores(), False
+    with pycolmap.Database.open(database):
+        pass
+    single = pycolmap.CameraMode.SINGLE
+    pycolmap.import_images(database, images, camera_mode=single, options=reader)
     pycolmap.extract_features(
-        database,
-        images,
-        camera_mode=pycolmap.CameraMode.SINGLE,
-        reader_options=reader,
-        extraction_options=extraction,
+        database, images, camera_mode=single, reader_options=reader, extraction_options=extraction
     )
     matching = pycolmap.FeatureMatchingOptions()
     matching.num_threads, matching.use_gpu = job["threads"], False
     pairing = pycolmap.SequentialPairingOptions()
     pairing.overlap, pairing.quadratic_overlap, pairing.num_threads = job["overlap"], True, job["threads"]
     pycolmap.match_sequential(database, matching_options=matching, pairing_options=pairing)
-    find = _mapped if job["path"] is None else _placed
-    model, angle = find(root, database, images, job)
-    if model is not None:
-        np.savez(root / "out.npz", allow_pickle=False, least_angle=np.array(angle), **_arrays(model))
 
 
 def _mapping(job: dict[str, Any], count: int, first_angle: float, angle: float):
@@ -111,7 +124,6 @@ def _placed(root: Path, database: Path, images: Path, job: dict[str, Any]):
     """A model whose cameras are known but for a little, and its least angle."""
     with pycolmap.Database.open(database) as db:
         found, camera = db.read_all_images(), db.read_all_cameras()[0]
-    camera.params = [job["focal"], *job["center"]]
     best, best_angle = None, 0.0
     for _, angle in _ANGLES:
         model = pycolmap.Reconstruction()

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -70,6 +70,14 @@ class Structure:
         return first, last
 
 
+@contextlib.contextmanager
+def workspace() -> Iterator[Path]:
+    """A folder in which features and matches stay from one `reconstruct_structure` to the next."""
+    _remove_orphans()
+    with tempfile.TemporaryDirectory(prefix=f"{_PREFIX}{os.getpid()}-") as folder:
+        yield Path(folder)
+
+
 def reconstruct_structure(
     frames: np.ndarray,
     masks: np.ndarray,
@@ -82,6 +90,7 @@ def reconstruct_structure(
     seed: int = 0,
     threads: int = 1,
     path: np.ndarray | None = None,
+    folder: Path | None = None,
     waiting: Callable[[float], None] = lambda seconds: None,
 ) -> Structure | None:
     """Cameras of the frames `keys` and sparse points of what is not masked; None when COLMAP finds no model or crashes.
@@ -91,23 +100,17 @@ def reconstruct_structure(
         focal: px, start, kept when not `refine_focal`.  features: per frame.  overlap: frames matched with each.
         threads: of COLMAP after its features; with more than one, each run gives slightly other numbers.
         path: (N, 4, 4) cameras of `keys` that are known but for a little; without, they are found.
+        folder: of `workspace`, for several models of the same key frames, which are known by their number; features and
+            matches are the first one's. Without, it is the call's own.
         waiting: called twice a second with the seconds that it has taken; what it raises ends the process.
 
     Raises:
         StageFailed: the process failed.
     """
-    import cv2
-
-    _remove_orphans()
-    with tempfile.TemporaryDirectory(prefix=f"{_PREFIX}{os.getpid()}-") as folder:
-        root = Path(folder)
-        (root / "images").mkdir()
-        (root / "masks").mkdir()
-        around = np.ones((9, 9), np.uint8)
-        for k in keys:
-            cv2.imwrite(str(root / "images" / _name(k)), frames[k][..., ::-1])
-            free = 255 - 255 * cv2.dilate(masks[k].astype(np.uint8), around)
-            cv2.imwrite(str(root / "masks" / f"{_name(k)}.png"), free)
+    with workspace() if folder is None else contextlib.nullcontext(folder) as kept:
+        root = kept / str(len(keys))
+        if not root.exists():
+            _write(root, frames, masks, keys)
         height, width = frames.shape[1:3]
         job = {
             "focal": focal,
@@ -120,7 +123,8 @@ def reconstruct_structure(
             "path": None if path is None else {_name(k): T.tolist() for k, T in zip(keys, path, strict=True)},
         }
         (root / "job.json").write_text(json.dumps(job))
-        status = _run([sys.executable, "-m", "slomo.reconstruct.colmap", folder], root / "errors.txt", waiting)
+        (root / "out.npz").unlink(missing_ok=True)
+        status = _run([sys.executable, "-m", "slomo.reconstruct.colmap", str(root)], root / "errors.txt", waiting)
         if status in _CRASHED:  # COLMAP does on some pictures of a few textures; killed is another thing
             return None
         if status:
@@ -130,6 +134,19 @@ def reconstruct_structure(
             return None
         with np.load(root / "out.npz") as z:
             return Structure.of({k: z[k] for k in z.files})
+
+
+def _write(root: Path, frames: np.ndarray, masks: np.ndarray, keys: np.ndarray) -> None:
+    """The pictures and what of them is free of the subject."""
+    import cv2
+
+    (root / "images").mkdir(parents=True)
+    (root / "masks").mkdir()
+    around = np.ones((9, 9), np.uint8)
+    for k in keys:
+        cv2.imwrite(str(root / "images" / _name(k)), frames[k][..., ::-1])
+        free = 255 - 255 * cv2.dilate(masks[k].astype(np.uint8), around)
+        cv2.imwrite(str(root / "masks" / f"{_name(k)}.png"), free)
 
 
 def _name(key: int) -> str:

@@ -13,7 +13,7 @@ from slomo.packed import pack, unpack
 from slomo.stage import Artifact, Inputs, Progress
 
 MASKS_VERSION = 26
-CAMERA_VERSION = 11
+CAMERA_VERSION = 12
 QUALITIES = ("draft", "normal", "high")
 
 SEGMENTERS = ("auto", "u2netp", "still", "motion", "user")
@@ -131,7 +131,8 @@ def run_camera(inputs: Inputs, config: CameraConfig, progress: Progress) -> Arti
     Raises:
         StageFailed: structure from motion died.
     """
-    from slomo.reconstruct.camera import CameraSettings, estimate_camera
+    from slomo.reconstruct.camera import estimate_camera
+    from slomo.reconstruct.camera_world import CameraSettings
 
     decoded = inputs.artifacts["decode"]
     frames, t = decoded.npz["frames.npz"]["frames"], decoded.npz["frames.npz"]["t"]

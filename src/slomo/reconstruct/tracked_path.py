@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from slomo.reconstruct.pairwise import huber_cost, minimise
-from slomo.reconstruct.rotation_ba import skew
+from slomo.reconstruct.rotation_ba import RotationFit, skew
 from slomo.reconstruct.tracks import Tracks
 
 _MOST_SHARED = 40  # correspondences of two frames, on average, that are used
@@ -38,7 +38,7 @@ class TrackedPath:
         focal: px.
         cost: of `Epipolar.cost`.
         in_front: part of the sightings whose point lies before the camera.
-        agreed: whether another start led to the same; never where the focal length was freed, for that is one start.
+        agreed: whether another start led to the same; never where the focal length was freed.
     """
 
     T_world_cam: np.ndarray
@@ -122,22 +122,25 @@ def track_path(
     seed: int,
     turning: np.ndarray,
     *,
-    refine_focal: bool,
-) -> TrackedPath | None:
-    """Cameras of the frames `keys` (N,); None where no track is seen in three of them, which alone tells how far each
-    is from the next.
+    freed: RotationFit | None,
+) -> list[TrackedPath]:
+    """Cameras of the frames `keys` (N,): with the focal length that is given, and with one of their own where that
+    explains the tracks better, or where it is in doubt; the better first. None where no track is seen in three of the
+    frames, which alone tells how far each is from the next.
 
     Args:
         epipolar: correspondences of the tracks between these frames.
-        center: (2,) px, principal point.  focal: px; kept when not `refine_focal`, and where another one explains the
-            tracks little better.  seed: of the draw of tracks where there are many.
+        center: (2,) px, principal point.  focal: px; kept where another one explains the tracks little better.
+        seed: of the draw of tracks where there are many.
         turning: (N, 3, 3) rotations of a camera of this focal length that only turns and explains as much as it can.
             Which part of them is travel is unknown: the path is sought from all of them, none and half, until two
             agree. (One of refined focal length turns by several times as much where there is parallax.)
+        freed: the turning camera whose focal length is refined: where there is hardly any parallax it is nearly right,
+            and the path with a focal length of its own is sought from it too. None keeps the focal length.
     """
     sightings = _Sightings(tracks, keys, center, seed)
     if len(sightings.track) == 0:
-        return None
+        return []
     turns = Rotation.from_matrix(turning[0].T @ turning).as_rotvec()
     found: list[TrackedPath] = []
     for share in (1.0, 0.0, 0.5):
@@ -147,11 +150,14 @@ def track_path(
         if len(found) > 1 and _SETTLED * found[1].cost < found[0].cost:
             found[0] = replace(found[0], agreed=True)
             break
-    if refine_focal:
-        freed = _from(epipolar, sightings, found[0].T_world_cam[:, :3, :3], focal, free_focal=True)
-        if freed.cost < _BETTER * found[0].cost and freed.in_front >= min(found[0].in_front, IN_FRONT):
-            return freed
-    return found[0]
+    kept = found[0]
+    if freed is None:
+        return [kept]
+    starts = (kept.T_world_cam[:, :3, :3], focal), (freed.R_world_cam, freed.focal)
+    other = min((_from(epipolar, sightings, *start, free_focal=True) for start in starts), key=lambda path: path.cost)
+    if other.cost < _BETTER * kept.cost:
+        return [other, kept]
+    return [kept] if kept.agreed else [kept, other]
 
 
 def _from(epipolar: Epipolar, sightings: "_Sightings", R: np.ndarray, focal: float, *, free_focal: bool) -> TrackedPath:
