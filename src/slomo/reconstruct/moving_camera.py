@@ -1,7 +1,7 @@
 """Structure from motion of a clip: which of several starts leads to the cameras that explain the tracks best."""
 
 import math
-from functools import partial
+import time
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +79,12 @@ def _found(
     h, w = frames.shape[1:3]
     center = np.array([(w - 1) / 2, (h - 1) / 2])
     keys, gaps = key_frames(t, shown, s.key_every)
+    began, usual = time.monotonic(), 1.5 * len(keys)
+
+    def waiting(_: float) -> None:
+        """The share of the work that is done can only be guessed, from the seconds that it takes usually."""
+        took = time.monotonic() - began
+        progress.update(0.2 + 0.6 * took / (took + usual), "structure from motion")
 
     def solve(keys: np.ndarray, path: TrackedPath | None = None) -> sfm.Structure | None:
         return sfm.reconstruct_structure(
@@ -92,7 +98,7 @@ def _found(
             seed=s.seed,
             path=path.T_world_cam if path else None,
             folder=folder,
-            waiting=partial(_waiting, progress, 1.5 * len(keys)),
+            waiting=waiting,
         )
 
     placed, explained, agreed = None, np.inf, False
@@ -127,8 +133,3 @@ def _found(
 def _same(a: sfm.Structure, cost_a: float, b: sfm.Structure, cost_b: float) -> bool:
     near = min(cost_a, cost_b) > _SAME_COST * max(cost_a, cost_b)
     return near and abs(math.log(a.focal / b.focal)) < _SAME_FOCAL
-
-
-def _waiting(progress, usual: float, took: float) -> None:
-    """The share of structure from motion's work that is done can only be guessed, from the s that it takes usually."""
-    progress.update(0.2 + 0.6 * took / (took + usual), "structure from motion")
