@@ -63,21 +63,24 @@ def retreating(seed: int, degrees: float):
     p = np.column_stack([0.3 * along + 0.02 * np.sin(9 * along), 0.02 * np.cos(7 * along), -1.2 * along])
     R = Rotation.from_euler("yx", np.column_stack([degrees * along, -12 + 1.5 * np.sin(8 * along)]), degrees=True)
     ground = np.column_stack([rng.uniform(-8, 8, 1500), np.full(1500, 0.5), rng.uniform(0.6, 14, 1500)])
-    frame, track, xy = [], [], []
-    for t in range(T):
-        X = (ground - p[t]) @ R[t].as_matrix()
-        uv = FOCAL * X[:, :2] / X[:, 2:] + CENTER + rng.normal(0, 0.15, (len(X), 2))
+    return R.as_matrix(), p, tracks_of(R.as_matrix(), p, ground, rng, noise=0.15, wrong=4.0)
+
+
+def tracks_of(R: np.ndarray, p: np.ndarray, things: np.ndarray, rng, *, noise: float, wrong: float) -> Tracks:
+    """Tracks of `things` (N, 3) with `noise` px, every tenth of them off by `wrong` px more."""
+    rows = []
+    for t in range(len(R)):
+        X = (things - p[t]) @ R[t]
+        uv = FOCAL * X[:, :2] / X[:, 2:] + CENTER + rng.normal(0, noise, (len(X), 2))
         seen = np.flatnonzero((X[:, 2] > 0.2) & (uv >= 0).all(-1) & (uv < [480, 270]).all(-1))
-        wrong = seen % 10 == 0
-        uv[seen[wrong]] += rng.normal(0, 4, (wrong.sum(), 2))
-        frame.append(np.full(len(seen), t))
-        track.append(seen)
-        xy.append(uv[seen])
-    return R.as_matrix(), p, Tracks(*(np.concatenate(column) for column in (frame, track, xy)))
+        tenth = seen[seen % 10 == 0]
+        uv[tenth] += rng.normal(0, wrong, (len(tenth), 2))
+        rows.append((np.full(len(seen), t), seen, uv[seen]))
+    return Tracks(*(np.concatenate(column) for column in zip(*rows, strict=True)))
 
 
-def path_of(R: np.ndarray, tracks: Tracks, focal: float, *, refine_focal: bool):
-    """The path that the tracks give, the degrees by which its rotations are off at most, and its correspondences."""
+def paths_of(R: np.ndarray, tracks: Tracks, focal: float, *, refine_focal: bool) -> tuple[list[TrackedPath], Epipolar]:
+    """The paths that the tracks give, and their correspondences."""
     keys, gaps = np.arange(len(R)), (1, 3, 8, 16)
     epipolar = Epipolar(tracks, keys, gaps, CENTER, 0)
     assert epipolar.least_shared > 20
@@ -86,7 +89,12 @@ def path_of(R: np.ndarray, tracks: Tracks, focal: float, *, refine_focal: bool):
         for free in (False, True)
     )
     free = freed if refine_focal else None
-    path = track_path(epipolar, tracks, keys, CENTER, focal, 0, turning.R_world_cam, freed=free)[0]
+    return track_path(epipolar, tracks, keys, CENTER, focal, 0, turning.R_world_cam, freed=free), epipolar
+
+
+def path_of(R: np.ndarray, tracks: Tracks, focal: float, *, refine_focal: bool):
+    """The best of them, the degrees by which its rotations are off at most, and the correspondences."""
+    (path, *_), epipolar = paths_of(R, tracks, focal, refine_focal=refine_focal)
     return path, off_by(path, R), epipolar
 
 
@@ -138,27 +146,14 @@ def turning_about(degrees: float, travel: float):
     angle, away = np.radians(rng.uniform(-40, degrees + 40, N)), rng.uniform(4, 16, N)
     height = np.where(rng.random(N) < 0.6, 1.4, rng.uniform(-2, 1.4, N))
     things = np.column_stack([away * np.sin(angle), height, away * np.cos(angle)])
-    rows = []
-    for t in range(T):
-        X = (things - p[t]) @ R[t].as_matrix()
-        uv = FOCAL * X[:, :2] / X[:, 2:] + CENTER + rng.normal(0, 0.05, (N, 2))
-        seen = np.flatnonzero((X[:, 2] > 0.2) & (uv >= 0).all(-1) & (uv < [480, 270]).all(-1))
-        rows.append((np.full(len(seen), t), seen, uv[seen]))
-    return R.as_matrix(), Tracks(*(np.concatenate(column) for column in zip(*rows, strict=True)))
+    R = R.as_matrix()
+    return R, tracks_of(R, p, things, rng, noise=0.05, wrong=0.0)
 
 
 def test_a_camera_that_hardly_travels_is_also_sought_with_a_focal_length_of_its_own():
     """A focal length that is wrong by 8 % bends its path; which path is right, bundle adjustment will tell."""
     R, tracks = turning_about(110.0, 0.1)
-    keys, gaps = np.arange(len(R)), (1, 3, 8, 16)
-    epipolar = Epipolar(tracks, keys, gaps, CENTER, 0)
-    turning, freed = (
-        rotation_ba.fit_rotations(
-            *tracks.pairs(gaps, keys), len(keys), center=CENTER, focal=0.92 * FOCAL, refine_focal=free
-        )
-        for free in (False, True)
-    )
-    paths = track_path(epipolar, tracks, keys, CENTER, 0.92 * FOCAL, 0, turning.R_world_cam, freed=freed)
+    paths, _ = paths_of(R, tracks, 0.92 * FOCAL, refine_focal=True)
     bent, right = sorted(paths, key=lambda path: abs(path.focal - FOCAL), reverse=True)
     assert bent.focal == 0.92 * FOCAL
     assert off_by(bent, R) > 3.0

@@ -125,7 +125,7 @@ def track_path(
     freed: RotationFit | None,
 ) -> list[TrackedPath]:
     """Cameras of the frames `keys` (N,): with the focal length that is given, and with one of their own where that
-    explains the tracks better, or where it is in doubt; the better first. None where no track is seen in three of the
+    explains the tracks better, or where it is in doubt; the better first. Empty where no track is seen in three of the
     frames, which alone tells how far each is from the next.
 
     Args:
