@@ -6,6 +6,7 @@ import torch
 
 from slomo.reconstruct import standing
 from slomo.reconstruct.kinematics import Kinematics, limb_links
+from slomo.runs import runs
 from slomo.skeleton import list_skeletons, load_skeleton
 
 T = np.arange(60) / 30
@@ -66,16 +67,11 @@ def test_smoothing_is_the_posterior_of_every_path():
     np.testing.assert_allclose(standing.smoothed(seen, change)[:, 0], total[:, 1] / total.sum(1), atol=1e-12)
 
 
-def test_stances_are_runs():
-    assert standing.stances(np.array([True, True, False, True, False, True])) == [(0, 2), (3, 4), (5, 6)]
-    assert standing.stances(np.zeros(3, bool)) == []
-
-
 def test_a_standing_foot_stays_and_one_in_the_air_is_not_moved_more_than_its_stances():
     feet, down = _stepping(noise=0.01)
     contact = np.where(down, 0.9, 0.1)[:, None]
     out = standing.places(feet, contact, T, SOLE)
-    for a, b in standing.stances(down):
+    for a, b in runs(down):
         assert np.ptp(out[a:b, 0], axis=0) == pytest.approx(0, abs=1e-12)
         assert out[a, 0, 2] == pytest.approx(SOLE)
     moved = np.abs(out - feet).max(axis=(1, 2))

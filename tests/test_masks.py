@@ -15,7 +15,7 @@ from slomo.reconstruct.flow import dense_flow
 from slomo.reconstruct.instances_motion import SharedMotion
 from slomo.reconstruct.motion_segment import border_distance
 from slomo.reconstruct.passing import give_back_what_passes
-from slomo.reconstruct.segment import component_at, frame_certainty, frame_quality, spans
+from slomo.reconstruct.segment import component_at, frame_certainty, frame_quality
 from slomo.reconstruct.stage import MasksConfig, run_masks
 from slomo.reconstruct.surroundings import _staying, give_back_patches, give_back_surroundings
 from slomo.reconstruct.votes import vote_over_time
@@ -245,15 +245,13 @@ def test_quality_falls_where_the_mask_jumps():
     assert frame_quality(halved, flow, np.full(10, 0.95))[4] < 0.9
 
 
-def test_certainty_and_spans():
+def test_certainty():
     mask = np.zeros((10, 10), bool)
     mask[2:8, 2:8] = True
     assert frame_certainty(mask.astype(np.float32), mask) == 1.0
     assert frame_certainty(np.where(mask, 0.6, 0.0), mask) == pytest.approx(0.6)
     assert frame_certainty(np.where(mask, 1.0, 0.3), mask) < 0.8
     assert frame_certainty(np.zeros((10, 10)), np.zeros_like(mask)) == 0.0
-    assert spans(np.array([True, True, False, True])) == [[0, 1], [3, 3]]
-    assert spans(np.zeros(4, bool)) == []
 
 
 @pytest.mark.parametrize("camera", [0.0, 1.0])

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from slomo.flesh import Cone
+from slomo.gravity import GRAVITY
 from slomo.reconstruct.kinematics import Kinematics
-from slomo.reconstruct.physics.model import GRAVITY, Body, Mechanics, build, solid
+from slomo.reconstruct.physics.model import Body, Mechanics, build, solid
 from slomo.reconstruct.physics.rollout import LEARNED, Controls, RollOut
 from slomo.skeleton import load_skeleton
 

@@ -11,6 +11,7 @@ from slomo.motion import KeypointMotion
 from slomo.retarget import clean, feet
 from slomo.retarget.stage import Config, run
 from slomo.robot import load_robot
+from slomo.runs import runs
 from slomo.stage import Artifact, Inputs, Silent
 from walking import PHASE, walk
 
@@ -66,7 +67,7 @@ def test_standing_feet_stand_even_when_the_reconstruction_slides():
     assert motion.contact is not None
     for limb in GO1.limb_names:
         foot, on = motion[f"{limb}_foot"], motion.contact[:, motion.contact_names.index(f"{limb}_foot")] > 0
-        for start, end in feet.runs(on):
+        for start, end in runs(on):
             assert np.ptp(foot[start:end], axis=0).max() < 1e-9
     assert out.json["report.json"]["slide_removed_m"] > 0.05
 
@@ -294,7 +295,7 @@ def test_creep_at_an_end_of_a_stance_is_swing_and_a_shuffle_is_a_step():
     x[:10, 0] = np.linspace(-0.3, 0, 10)  # still landing
     standing = np.ones(T, bool)
     trimmed = feet.split(x, standing, dt=dt, tolerance=0.05, step=0.24)
-    assert feet.runs(trimmed) == [(9, T)] or feet.runs(trimmed) == [(8, T)]
+    assert runs(trimmed) == [(9, T)] or runs(trimmed) == [(8, T)]
     x[:, 0] = 0.3 / (1 + np.exp(-(np.arange(T) - 50) / 3))
-    (_, end), (start, _) = feet.runs(feet.split(x, standing, dt=dt, tolerance=0.05, step=0.24))
+    (_, end), (start, _) = runs(feet.split(x, standing, dt=dt, tolerance=0.05, step=0.24))
     assert end < 50 < start

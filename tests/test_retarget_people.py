@@ -8,9 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from slomo.errors import InvalidData, UsageError
 from slomo.motion import KeypointMotion
-from slomo.retarget import feet, human
+from slomo.retarget import human
 from slomo.retarget.stage import Config, run
 from slomo.robot import load_robot
+from slomo.runs import runs
 from slomo.stage import Artifact, Inputs, Silent
 from walking import person, walk
 
@@ -80,7 +81,7 @@ def test_feet_are_flat_keep_their_length_and_stand_still():
         assert 0.5 < on.mean() < 0.8
         np.testing.assert_allclose(toe[on, 2], heel[on, 2], atol=1e-9)
         assert np.all(toe[~on, 2] <= heel[~on, 2] + 1e-9)  # toes hang down in a swing
-        for start, end in feet.runs(on):
+        for start, end in runs(on):
             assert np.ptp(toe[start:end], axis=0).max() < 1e-9
             assert np.ptp(heel[start:end], axis=0).max() < 1e-9
         assert toe[:, 2].max() > 0.05
@@ -109,7 +110,7 @@ def test_a_jump_leaves_the_ground_with_both_feet():
     motion, report, said = retarget(person(speed=0.0, jump=0.2, period=1.5))
     assert motion.contact is not None
     air = motion.contact.max(axis=1) == 0
-    assert len(feet.runs(air)) == 2
+    assert len(runs(air)) == 2
     assert report["airborne_fraction"] == pytest.approx(0.404 / 1.5, abs=0.1)
     rise = np.ptp(motion["base"][:, 2])
     assert rise == pytest.approx(0.2 * report["scale"], rel=0.25)

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from slomo.gravity import GRAVITY
 from slomo.pinhole import Intrinsics
 from slomo.reconstruct import gaits
 from slomo.reconstruct.gaits import SHORTLIST, Laid, diverse, ranked
-from slomo.reconstruct.hypotheses import GRAVITY, GaitHypothesis, gait_grid, gait_pose
+from slomo.reconstruct.hypotheses import GaitHypothesis, gait_grid, gait_pose
 from slomo.reconstruct.kinematics import Kinematics
 from slomo.reconstruct.stride import Steps, steps_of
 from slomo.skeleton import load_skeleton

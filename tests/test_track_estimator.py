@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slomo.pointfoot import GRAVITY
+from slomo.gravity import GRAVITY
 from slomo.robot import load_robot
 from slomo.terrain import Box, Terrain
 from slomo.track import inekf

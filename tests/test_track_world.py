@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 
 from slomo.cli import app
 from slomo.errors import UsageError
+from slomo.gravity import GRAVITY
 from slomo.motion import Reference
 from slomo.pipeline import Project
-from slomo.pointfoot import GRAVITY
 from slomo.robot import load_robot
 from slomo.terrain import Box, HeightField, Slope, Terrain
 from slomo.track.actuators import Motors, torque_limits

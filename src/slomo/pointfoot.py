@@ -14,12 +14,12 @@ from typing import Self
 import numpy as np
 
 from slomo.errors import InvalidData
+from slomo.gravity import GRAVITY
 from slomo.robot import Robot
 from slomo.robot_file import key_point_names
 from slomo.robot_workspace import directions
 
 Array = np.ndarray
-GRAVITY = 9.81  # m/s^2
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
+from slomo.gravity import GRAVITY
 from slomo.robot import Robot
 from slomo.track.joint_space import JointCommand, JointSpace
 
@@ -14,7 +15,6 @@ STEP = 0.005  # m, of height
 LOWEST = 0.3  # of the standing height, at which nobody needs to crouch further
 REACHED = 0.004  # m, of the feet
 TO_LIMIT = 0.05  # rad, at least, from any joint's limit
-GRAVITY = 9.81
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import numpy as np
 
 from slomo.motion import Reference
 from slomo.optimize.verify_ground import LOADED, normal_and_tangential
+from slomo.runs import runs
 from slomo.terrain import Terrain
 
 Array = np.ndarray
@@ -28,8 +29,7 @@ def contact_sequence(reference: Reference, terrain: Terrain, *, names: tuple[str
     contacts: list[dict[str, Any]] = []
     touchdowns: list[dict[str, Any]] = []
     for c, name in enumerate(names):
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], on[:, c], [False]]).astype(int)))
-        intervals = [[t[a], t[b]] for a, b in edges.reshape(-1, 2)]
+        intervals = [[t[a], t[b]] for a, b in runs(on[:, c])]
         stands = sum(b - a for a, b in intervals)
         contacts.append({"point": name, "intervals": intervals, "duty_factor": stands / duration})
         touchdowns += [{"t": a, "point": name} for a, _ in intervals if a > t[0]]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from slomo.gravity import GRAVITY
 from slomo.ground_path import ground_path
 from slomo.reconstruct.evidence import Evidence
 from slomo.reconstruct.kinematics import Kinematics, limb_links, yaw_pitch_roll
@@ -19,7 +20,6 @@ from slomo.skeleton import Gait, Skeleton
 
 Array = np.ndarray
 Tensor = torch.Tensor
-GRAVITY = 9.81
 _STANDS = 0.15  # of the clip's mean pace: strides that are slower than that have come to a stop
 _STRETCHES = (0.9, 0.95, 1.0, 1.05, 1.1), (0.95, 1.0, 1.05)  # of the likeliest stride frequency and the next
 

@@ -155,9 +155,3 @@ def _agreement(masks: np.ndarray, flow: Flow) -> np.ndarray:
         outline = (frame & (inner == 0)).sum()
         quality[t] = np.clip(np.mean(agreement) * jump * (1.0 - edge / max(1, edge + outline)), 0.0, 1.0)
     return quality
-
-
-def spans(chosen: np.ndarray) -> list[list[int]]:
-    """First and last index of each run of True in (T,) bool."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]])))
-    return [[int(a), int(b) - 1] for a, b in zip(edges[::2], edges[1::2], strict=True)]

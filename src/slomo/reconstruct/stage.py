@@ -10,6 +10,7 @@ import numpy as np
 
 from slomo.errors import InvalidData, UsageError
 from slomo.packed import pack, unpack
+from slomo.runs import runs
 from slomo.stage import Artifact, Inputs, Progress
 
 MASKS_VERSION = 26
@@ -87,7 +88,7 @@ def run_masks(inputs: Inputs, config: MasksConfig, progress: Progress) -> Artifa
     """
     from slomo.reconstruct.flow import dense_flow
     from slomo.reconstruct.instances import choose
-    from slomo.reconstruct.segment import frame_quality, spans
+    from slomo.reconstruct.segment import frame_quality
     from slomo.reconstruct.subject_flow import closer
 
     decoded = inputs.artifacts["decode"]
@@ -107,7 +108,7 @@ def run_masks(inputs: Inputs, config: MasksConfig, progress: Progress) -> Artifa
         "quality_poor_frames": int((quality[seen] < 0.7).sum()),
         "area_mean": float(found.masks.mean()),
         "frames_without_subject": int((~seen).sum()),
-        "spans_without_subject": spans(~seen),
+        "spans_without_subject": [[first, end - 1] for first, end in runs(~seen)],
         "flow_consistent": float(flow.consistent.mean()),
     } | found.report
     if found.report.get("instances", 1) > 1 and choice.how == "largest":

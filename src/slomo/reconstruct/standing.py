@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from slomo.reconstruct.kinematics import Kinematics, limb_links
+from slomo.runs import runs
 
 Array = np.ndarray
 Tensor = torch.Tensor
@@ -61,12 +62,6 @@ def smoothed(log_likelihood: Array, change: Array) -> Array:
     return _logistic(both[..., 1] - both[..., 0])
 
 
-def stances(down: Array) -> list[tuple[int, int]]:
-    """Frames [a, b) of each run of true values of (T,) bool."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], down.astype(int), [0]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
-
-
 def places(feet: Array, contact: Array, t: Array, ground: float) -> Array:
     """(T, F, 3) where the feet go: through each stance at its mean place, `ground` high; in between the correction
     changes evenly from one stance's to the next one's, but the foot is never below the ground. A foot that never stands
@@ -74,7 +69,7 @@ def places(feet: Array, contact: Array, t: Array, ground: float) -> Array:
     out = feet.copy()
     for f in range(feet.shape[1]):
         moves = np.full((len(t), 3), np.nan)
-        for a, b in stances(contact[:, f] > 0.5):
+        for a, b in runs(contact[:, f] > 0.5):
             place = np.average(feet[a:b, f], axis=0, weights=contact[a:b, f])
             place[2] = ground
             moves[a:b] = place - feet[a:b, f]

@@ -11,6 +11,7 @@ from slomo.motion import KeypointMotion, Reference
 from slomo.optimize.inverse import JointMotion
 from slomo.optimize.sequence import in_contact
 from slomo.robot import Robot
+from slomo.runs import runs
 from slomo.terrain import Terrain
 
 Array = np.ndarray
@@ -47,8 +48,7 @@ def contacts_and_torques(
 
 def _intervals(t: Array, on: Array) -> list[tuple[float, float]]:
     """Start and duration (s) of the runs of on (T - 1,) between times (T,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(int))).reshape(-1, 2)
-    return [(float(t[a]), float(t[b] - t[a])) for a, b in edges]
+    return [(float(t[a]), float(t[b] - t[a])) for a, b in runs(on)]
 
 
 def _draw_contacts(axis: Axes, target: KeypointMotion, reference: Reference, robot: Robot, terrain: Terrain) -> None:

@@ -6,8 +6,9 @@ import numpy as np
 
 from slomo.errors import UsageError
 from slomo.formats.mp4 import encode_mp4
+from slomo.gravity import GRAVITY
 from slomo.motion import Reference
-from slomo.pointfoot import GRAVITY, PointFootModel
+from slomo.pointfoot import PointFootModel
 from slomo.report.panels import Panel, ReferencePanel, RobotPanel
 from slomo.report.video import Composer, FootFalls, draw_all
 from slomo.stage import Artifact, Inputs, Progress

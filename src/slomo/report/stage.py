@@ -7,9 +7,10 @@ import numpy as np
 
 from slomo.errors import InvalidData, UsageError
 from slomo.formats.mp4 import encode_mp4
+from slomo.gravity import GRAVITY
 from slomo.motion import KeypointMotion, Reference, Rollout
 from slomo.optimize.inverse import joint_motion
-from slomo.pointfoot import GRAVITY, PointFootModel
+from slomo.pointfoot import PointFootModel
 from slomo.report import table
 from slomo.report.evidence import evidence_picture
 from slomo.report.panels import ClipPanel, KeypointPanel, Panel, ReferencePanel, RobotPanel, heading

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from slomo.report.panels import SIZE, Panel, side_color
+from slomo.runs import runs
 
 BACKGROUND, INK, FAINT = (250, 250, 250), (35, 35, 38), (205, 206, 210)
 CAPTION, GAP, ROW, LEFT = 26, 6, 9, 112  # px: caption's height, space, a bar of the foot-fall strip, where bars begin
@@ -46,8 +47,7 @@ def _bars(
     draw: ImageDraw.ImageDraw, t: np.ndarray, on: np.ndarray, x: Callable[[float], float], y: float, color
 ) -> None:
     """One bar for each time that `on` is true."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(int), [0]])))
-    for a, b in edges.reshape(-1, 2):
+    for a, b in runs(on):
         draw.rectangle([x(float(t[a])), y, x(float(t[min(b, len(t) - 1)])), y + ROW // 2 - 1], fill=color)
 
 

@@ -7,6 +7,7 @@ from scipy.linalg import solveh_banded
 from scipy.ndimage import median_filter
 
 from slomo.motion import KeypointMotion
+from slomo.runs import runs
 
 _HUBER = 1.5  # residuals beyond this many robust standard deviations lose weight
 
@@ -125,12 +126,6 @@ def despike(motion: KeypointMotion, *, size: float, window: float) -> KeypointMo
             away = np.linalg.norm(x - median_filter(x, (n, 1), mode="reflect"), axis=1)
             confidence[known[away > size], i] = 0.0
     return replace(motion, confidence=confidence)
-
-
-def runs(on: np.ndarray) -> list[tuple[int, int]]:
-    """(start, end) of the runs of True in (T,), end exclusive."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(int), [0]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def longest_run(good: np.ndarray) -> slice:

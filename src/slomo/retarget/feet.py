@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, median_filter, minimum_filter1d
 
-from slomo.retarget.clean import runs
+from slomo.runs import runs
 
 _HELD = 0.3  # of the legs' length: a foot whose floor is this much higher than the other one's of its pair never stands
 _JUMP = 0.16  # s, flight of a jump of three centimetres

@@ -11,6 +11,7 @@ from slomo.errors import InvalidData, UsageError
 from slomo.motion import KeypointMotion
 from slomo.retarget import clean
 from slomo.retarget.trunk import Pairs, Trunk, seen
+from slomo.runs import runs
 from slomo.stage import Progress
 
 if TYPE_CHECKING:
@@ -72,7 +73,7 @@ def _say_gaps(motion: KeypointMotion, report: dict[str, Any], progress: Progress
     gaps = {}
     for name, c in zip(motion.names, motion.confidence.T, strict=True):
         if np.any(c > 0):
-            gaps[name] = step * max((end - start for start, end in clean.runs(c == 0)), default=0)
+            gaps[name] = step * max((end - start for start, end in runs(c == 0)), default=0)
     report["longest_gap_s"] = {n: round(g, 3) for n, g in gaps.items() if g > 0}
     worst = max(gaps, key=lambda n: gaps[n], default=None)
     if worst and gaps[worst] > _LONG_GAP:

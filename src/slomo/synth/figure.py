@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
+from slomo.gravity import GRAVITY
 from slomo.rotation import rot_zyx
 from slomo.synth.creature import Creature, forward, joint_rotation
-from slomo.synth.gait import G, Path, smooth_random
+from slomo.synth.gait import Path, smooth_random
 
 Array = np.ndarray
 
@@ -105,9 +106,9 @@ def _idle(c: Creature, t: Array, rng: np.random.Generator) -> Array:
 def _strides(c: Creature, stride: Stride, t: Array, height: float, speed: float | None, turn: float, rng) -> _Plan:
     a, b = _leg(c)
     leg = (a + b) * height
-    usual = np.sqrt(stride.froude * G * leg)
+    usual = np.sqrt(stride.froude * GRAVITY * leg)
     v = (usual if speed is None else speed) / height
-    rate = stride.rate * np.sqrt(G / leg) * np.sqrt(v * height / usual)
+    rate = stride.rate * np.sqrt(GRAVITY / leg) * np.sqrt(v * height / usual)
     path, start = Path(v, turn, 0.0), rng.uniform()
     ball, pitch, contact = np.zeros((len(t), 2, 3)), np.zeros((len(t), 2)), np.zeros((len(t), 2), bool)
     q, at = _idle(c, t, rng), _number(c)
@@ -193,9 +194,9 @@ def _on_the_spot(c: Creature, name: str, t: Array, rng: np.random.Generator) -> 
             q[:, at[f"{side}_shoulder"], 1] -= lean + round_
     elif name == "jump":
         flight, deep = u(0.28, 0.42), u(0.08, 0.14)
-        push = 2 * deep / (G / _TYPICAL / 2 * flight)  # s, from rest to take-off, and from landing to rest
+        push = 2 * deep / (GRAVITY / _TYPICAL / 2 * flight)  # s, from rest to take-off, and from landing to rest
         s = (t / (period + 0.5) + rng.random()) % 1.0 * (period + 0.5) - push - 0.4  # from take-off
-        up = np.where((s > 0) & (s < flight), G / _TYPICAL / 2 * s * (flight - s), 0.0)
+        up = np.where((s > 0) & (s < flight), GRAVITY / _TYPICAL / 2 * s * (flight - s), 0.0)
         contact &= ~((s > 0) & (s < flight))[:, None]
         away = np.where(s < flight / 2, -s, s - flight)  # s, from the air, on either side of it
         crouch = np.where(away < push, 1 - (1 - np.clip(away / push, 0, 1)) ** 2, _eased(1 - (away - push) / 0.4))

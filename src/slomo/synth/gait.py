@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slomo.gravity import GRAVITY
 from slomo.rotation import rot_zyx
 from slomo.synth.acts import ACTS, perform
 from slomo.synth.animal import FEET, KEYPOINTS, LEG_JOINTS, Proportions, rest_joints
 
-G = 9.81
 _FOLDED = 0.36  # of the lengths of a leg's upper bones: the least distance between their ends, of a paw in the air
 
 
@@ -131,10 +131,10 @@ def animate(p: Proportions, gait_name: str, t: np.ndarray, *, speed: float | Non
     act = perform(gait_name, p, t, seed)
     rng = np.random.default_rng([seed, 3])
     hip = p.hip * h
-    usual = np.sqrt(gait.froude * G * hip)
+    usual = np.sqrt(gait.froude * GRAVITY * hip)
     v = usual if speed is None else speed
     # Animals lengthen and quicken their stride together as they speed up.
-    rate = gait.rate * np.sqrt(G / hip) * (np.sqrt(v / usual) if usual and v else 1.0)
+    rate = gait.rate * np.sqrt(GRAVITY / hip) * (np.sqrt(v / usual) if usual and v else 1.0)
     path = Path(v, turn, p.trunk * h / 2)
     paws, contact, phase, stride = _feet(gait, rate, t, path, rest, gait.lift * h, rng)
     paws, contact = paws + h * act.paws, contact & act.contact

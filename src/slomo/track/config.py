@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slomo.errors import UsageError
-from slomo.pointfoot import GRAVITY
+from slomo.gravity import GRAVITY
 from slomo.robot import Robot
 from slomo.track.mpc import MODELS, MpcConfig
 from slomo.track.planner import PLANNERS

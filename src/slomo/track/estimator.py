@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin  # pyright: ignore[reportMissingImports]
 from scipy.spatial.transform import Rotation
 
-from slomo.pointfoot import GRAVITY
+from slomo.gravity import GRAVITY
 from slomo.robot import Robot
 from slomo.terrain import Terrain
 from slomo.track import inekf

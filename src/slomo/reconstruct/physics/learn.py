@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from slomo.reconstruct.physics.model import GRAVITY, Body
+from slomo.gravity import GRAVITY
+from slomo.reconstruct.physics.model import Body
 from slomo.reconstruct.physics.rollout import Controls, RollOut, Watched
 from slomo.reconstruct.physics.windows import Guides, Kinematic, Windows, cover, guides
 

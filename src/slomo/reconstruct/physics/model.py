@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from slomo.flesh import Cone
+from slomo.gravity import GRAVITY
 from slomo.reconstruct.kinematics import Posed
 from slomo.skeleton import Skeleton
 
 Array = np.ndarray
 
 DENSITY = 1000.0  # kg/m^3, flesh
-GRAVITY = 9.81  # m/s^2
 LEAST_MASS = 0.002  # of the whole body's: a link without volume of its own still has this
 SAME = 0.08  # body lengths between two places on a link that are one contact point
 CELL = 0.01  # body lengths, of the grid of points whose mass is summed

@@ -6,8 +6,9 @@ import numpy as np
 import torch
 import warp as wp
 
+from slomo.gravity import GRAVITY
 from slomo.reconstruct.physics import kernel
-from slomo.reconstruct.physics.model import GRAVITY, Body
+from slomo.reconstruct.physics.model import Body
 
 Tensor = torch.Tensor
 

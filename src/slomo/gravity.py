@@ -1,0 +1,3 @@
+"""The one value of g."""
+
+GRAVITY = 9.81  # m/s^2
