@@ -14,6 +14,7 @@ import numpy as np
 
 from bench_prior import BADJA, SHARED
 from slomo.cli.session import Session
+from slomo.packed import unpack
 
 NEAR = 0.2
 
@@ -34,7 +35,7 @@ def main() -> None:
     with np.load(made / "keypoints.npz") as z:
         names, X, K, T = [str(n) for n in z["keypoint_names"]], z["keypoints"], z["K"], z["T_world_cam"]
     with np.load(folder / "masks.npz") as z:
-        area = np.unpackbits(z["packed"], axis=-1)[..., : z["shape"][2]].sum((1, 2))
+        area = unpack(z).sum((1, 2))
     seen = np.einsum("tij,tki->tkj", T[:, :3, :3], X - T[:, None, :3, 3]) @ K.T
     scale = video["width"] / video["source_width"]
     uv = (seen[..., :2] / seen[..., 2:] + 0.5) / scale - 0.5

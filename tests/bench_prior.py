@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from slomo.cli.session import Session
+from slomo.packed import unpack
 from slomo.prior import metrics
 from slomo.prior.evaluate import Truth, judge, predict, truth_of
 from slomo.prior.inference import Prior, packaged, peaks
@@ -38,7 +39,7 @@ BADJA = {
 def read_masks(path: Path, frames: np.ndarray) -> np.ndarray:
     """(T, H, W) bool, in the size of the decoded frames (T, H, W, 3)."""
     with np.load(path) as z:
-        masks = np.unpackbits(z["packed"], axis=-1)[..., : z["shape"][2]]
+        masks = unpack(z).astype(np.uint8)
     assert len(masks) == len(frames), f"{path}: {len(masks)} masks of {len(frames)} frames"
     size = frames.shape[2], frames.shape[1]
     return np.stack([cv2.resize(m, size, interpolation=cv2.INTER_NEAREST) for m in masks]).astype(bool)

@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation
 import slomo.skeleton
 from slomo.cli.session import Session
 from slomo.formats import load_keypoints
+from slomo.packed import pack, unpack
 from slomo.prior import stage as prior_stage
 from slomo.reconstruct import fit_stage, refine_stage
 from slomo.reconstruct.subject_flow import closer
@@ -58,7 +59,7 @@ def spoiled_masks(inputs: Inputs, rng: np.random.Generator) -> Inputs:
     """Every frame's mask eroded or dilated, with holes or bites."""
     masks = inputs.artifacts["masks"]
     z = masks.npz["masks.npz"]
-    full = np.unpackbits(z["packed"], axis=-1)[..., : int(z["shape"][2])]
+    full = unpack(z).astype(np.uint8)
     out = []
     for m in full:
         size = np.sqrt(max(int(m.sum()), 1))
@@ -72,7 +73,7 @@ def spoiled_masks(inputs: Inputs, rng: np.random.Generator) -> Inputs:
     worse = np.array(out)
     both, either = (worse & full).sum((1, 2)), np.maximum((worse | full).sum((1, 2)), 1)
     print(f"  masks: IoU with the estimated ones {np.mean(both / either):.2f}", flush=True)
-    packed = dict(z) | {"packed": np.packbits(worse, axis=-1)}
+    packed = dict(z) | pack(worse)
     frames = inputs.artifacts["decode"].npz["frames.npz"]["frames"]
     npz = {"masks.npz": packed, "flow.npz": {**masks.npz["flow.npz"], **closer(frames, worse.astype(bool))}}
     return replace(inputs, artifacts={**inputs.artifacts, "masks": replace(masks, npz=npz)})

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from slomo.packed import pack
 from slomo.pinhole import Intrinsics
 from slomo.prior.labels import BINS, labels
 from slomo.reconstruct import evidence_terms, fit, hypotheses, losses, silhouette
@@ -60,7 +61,7 @@ def _variables(path: Trajectory) -> dict[str, torch.Tensor]:
 
 
 def _observations(mask: np.ndarray) -> Observations:
-    masks = dict(packed=np.packbits(mask, axis=-1), shape=np.array(mask.shape), quality=np.ones(T))
+    masks = dict(**pack(mask), quality=np.ones(T))
     flow = dict(flow=np.zeros((T - 1, H, W, 2), np.float16), consistent=np.packbits(mask[1:], axis=-1))
     camera = dict(K=np.array([[K.fx, 0, K.cx], [0, K.fy, K.cy], [0, 0, 1]]), T_world_cam=np.tile(_camera(), (T, 1, 1)))
     return observe(np.arange(T) / FPS, masks, flow, camera, fps=FPS, subject_px=200)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from slomo.errors import InvalidData, UsageError
 from slomo.motion import KeypointMotion
+from slomo.packed import pack, unpack
 from slomo.pinhole import Intrinsics
 from slomo.reconstruct import fit, gaits, hypotheses, observations, silhouette
 from slomo.reconstruct.fit_stage import _effort, run_fit
@@ -79,13 +80,13 @@ def _walk() -> tuple[np.ndarray, dict, dict]:
         moved = np.stack([K.fx * Y[:, 0] / Y[:, 2] + K.cx, K.fy * Y[:, 1] / Y[:, 2] + K.cy], 1)
         flow[i] = moved - np.stack([u[0], v[0]], 1)
     flow = flow.reshape(T - 1, 90, 160, 2) * mask[:-1, ..., None]
-    masks = dict(packed=np.packbits(mask, axis=-1), shape=np.array(mask.shape), quality=np.ones(T))
+    masks = dict(**pack(mask), quality=np.ones(T))
     return pw, masks, dict(flow=flow.astype(np.float16), consistent=np.packbits(np.ones_like(mask[1:]), axis=-1))
 
 
 def _frames(masks: dict) -> np.ndarray:
     """A dark body in front of noise."""
-    inside = np.unpackbits(masks["packed"], axis=-1)[..., : masks["shape"][2]].astype(bool)
+    inside = unpack(masks)
     frames = np.random.default_rng(0).integers(100, 255, (*inside.shape, 3)).astype(np.uint8)
     frames[inside] //= 3
     return frames
@@ -271,7 +272,7 @@ def test_masks_of_something_else_fail(walk):
     _, masks, flow = walk
     junk = np.zeros((T, 90, 160), bool)
     junk[:, 10:80:9, ::3] = True
-    out = reconstruct(_inputs(masks | dict(packed=np.packbits(junk, axis=-1)), flow), TINY, Silent())
+    out = reconstruct(_inputs(masks | pack(junk), flow), TINY, Silent())
     assert out.failure
     assert "silhouette_iou" in out.failure
     assert out.json["report.json"]["verdict"]["trust"] == "unusable"

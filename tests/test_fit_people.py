@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from slomo.packed import pack
 from slomo.pinhole import Intrinsics
 from slomo.prior.labels import BINS
 from slomo.reconstruct import fit, gaits, hypotheses, pose_track, posture, silhouette
@@ -45,7 +46,7 @@ def problem_of(
     out = silhouette.outline(K, a, b, body.radii)
     sd, _ = silhouette.distances(out, u.reshape(1, -1).expand(T, -1), v.reshape(1, -1).expand(T, -1))
     mask = (sd[0].amin(-1) < 0).reshape(T, H, W).numpy()
-    masks = dict(packed=np.packbits(mask, axis=-1), shape=np.array(mask.shape), quality=np.ones(T))
+    masks = dict(**pack(mask), quality=np.ones(T))
     flow = dict(flow=np.zeros((T - 1, H, W, 2), np.float16), consistent=np.packbits(mask[1:], axis=-1))
     camera = dict(K=np.array([[K.fx, 0, K.cx], [0, K.fy, K.cy], [0, 0, 1]]), T_world_cam=np.tile(M, (T, 1, 1)))
     obs = observe(np.arange(T) / FPS, masks, flow, camera, fps=8, subject_px=42)

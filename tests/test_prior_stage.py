@@ -9,6 +9,7 @@ onnx = pytest.importorskip("onnx", reason="needs the onnx package (pip install '
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 
 from slomo.errors import InvalidData, UsageError  # noqa: E402
+from slomo.packed import pack  # noqa: E402
 from slomo.prior import stage  # noqa: E402
 from slomo.prior.crop import Box, from_crop  # noqa: E402
 from slomo.prior.external import ExternalModel, load_map  # noqa: E402
@@ -125,7 +126,7 @@ def inputs(**files):
     masks[6] = False  # the subject is lost for a frame
     flow = np.zeros((T - 1, H, W, 2), np.float16)
     flow[masks[:-1]] = (1, 0)
-    packed = {"packed": np.packbits(masks, axis=-1), "shape": np.array(masks.shape), "quality": np.full(T, 0.8)}
+    packed = {**pack(masks), "quality": np.full(T, 0.8)}
     video = dict(
         source_width=2 * W,
         source_height=2 * H,
