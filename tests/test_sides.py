@@ -101,7 +101,7 @@ def test_who_stays_in_place_is_turned_around_once_more_with_time_to_settle():
     turned = [label.get("seen") for label in best.labels].index("the other way")
     assert np.degrees(float(best.guess.yaw[turned, 0]) - TOWARDS_CAMERA) % 360 == pytest.approx(180, abs=3)
     long = fit.Effort((*(replace(p, rate=n) for n, p in enumerate(phases)),), 1, 1)
-    assert [s.rate for s in fit._long_enough(long, problem, root).schedules] == [0, 1, 2, 3, 3, 5, 6]
+    assert [s.rate for s in fit._long_enough(long, problem, root).schedules] == [0, 1, 2, 3, 3, 5, 6, 7]
     assert fit._long_enough(long, problem, replace(root, travelled=3.0)) is long
 
 

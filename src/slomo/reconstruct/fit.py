@@ -1,17 +1,18 @@
 """The fit, coarse to fine: size and trunk with headings, then gaits with the legs, then the rivals, then the winner,
 and that once more beside those with limbs where they are seen better, alike strides, a leg that does as the other
 one, or left and right exchanged. Then, only where there is something to compare it with, once more with alike strides
-and with legs that overtake.
+and with legs that overtake each other, of one pair and then of the other.
 
 Every phase is one `optimise` of a batch of hypotheses; between phases they are ranked by loss on fixed draws and the
 best go on. All of it is deterministic by the seed, and a checkpoint within any phase resumes to the same bits.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 
 from slomo.reconstruct import alike, gaits, hypotheses, limb_track, preferences, sides, starts
+from slomo.reconstruct.effort import FINAL, LIMBS, PHASES, Effort
 from slomo.reconstruct.hypotheses import RootGuess
 from slomo.reconstruct.overtaking import overtaking
 from slomo.reconstruct.problem import Problem, Schedule, Variables, optimise, pick, rank
@@ -25,20 +26,8 @@ TIE = 0.03  # a rival whose loss is higher by this share may still win in the en
 TURNED = 0.1  # the same of one that faces the other way: short fits say little of that
 ELSEWHERE = 0.1  # body lengths between the feet of two hypotheses that move their legs otherwise, on average
 _MOTION = ("gait", "legs", "seen")
-PHASES = ("heading", "gait", "rivals", "final", "limbs", "alike", "overtaking")
-LIMBS = PHASES.index("limbs")  # the last phase that all clips have
 _ALIKE = {LIMBS: "strides", PHASES.index("alike"): "alike"}  # what labels say of those whose strides are alike
 BEFORE = "before."  # prefix of the variables of the best one before a phase that comes after the limbs
-FINAL = PHASES.index("final")  # from there on little is between two hypotheses, and many draws tell them apart
-
-
-@dataclass(frozen=True)
-class Effort:
-    """How much work each phase does (`FitConfig` says it in the user's terms)."""
-
-    schedules: tuple[Schedule, ...]
-    candidates: int
-    phases_of_gait: int
 
 
 def fit(
@@ -57,14 +46,11 @@ def fit(
         run = starts.start(problem, root, generator)
     while run.phase < len(PHASES):
         schedule = effort.schedules[run.phase]
-        done = sum(_work(s) for name, s in zip(PHASES, effort.schedules, strict=True) if name in run.log)
-        total = max(_expected(effort, root), done + _work(schedule))
 
-        def each(
-            i: int, optimiser: torch.optim.Adam, loss: Tensor, run=run, schedule=schedule, done=done, total=total
-        ) -> None:
-            fraction = (done + i * _cost(schedule)) / total
-            progress.update(fraction, f"{PHASES[run.phase]} {i}/{schedule.iterations}, loss {float(loss.min()):.3f}")
+        def each(i: int, optimiser: torch.optim.Adam, loss: Tensor, run=run, schedule=schedule) -> None:
+            phase = PHASES[run.phase]
+            fraction = effort.reached(run.log, phase, i / schedule.iterations)
+            progress.update(fraction, f"{phase} {i}/{schedule.iterations}, loss {float(loss.min()):.3f}")
             if progress.checkpoint_due():
                 progress.save(checkpoint(run, i, optimiser, generator))
 
@@ -76,7 +62,7 @@ def fit(
         run.log[PHASES[run.phase]] = [
             label | {"loss": round(float(v), 4)} for label, v in zip(run.labels, losses, strict=True)
         ]
-        step = (_to_gait, _to_rivals, _to_final, _to_limbs, _to_alike, _to_overtaking, _to_the_end)[run.phase]
+        step = _STEPS[run.phase]
         run = step(problem, run, losses, root, effort, metres, progress)
     return run
 
@@ -100,19 +86,6 @@ def polish(problem: Problem, run: Run, schedule: Schedule, *, seed: int, progres
     return run
 
 
-def _cost(schedule: Schedule) -> float:
-    return schedule.frames * schedule.pixels + 2000
-
-
-def _work(schedule: Schedule) -> float:
-    return schedule.iterations * _cost(schedule)
-
-
-def _expected(effort: Effort, root: RootGuess) -> float:
-    """The work of all phases that the clip may have: where some are skipped, progress leaps ahead, and never back."""
-    return sum(_work(s) for s in (effort.schedules if root.travelled > 1 else effort.schedules[:-1]))
-
-
 def _to_gait(
     problem: Problem,
     run: Run,
@@ -123,8 +96,7 @@ def _to_gait(
     progress: Progress,
 ) -> Run:
     """The best few of the gaits over the best headings."""
-    first = effort.schedules[0]
-    done = _work(first) / _expected(effort, root)
+    done = effort.reached(run.log, "gait")
     return gaits.tried(
         problem, run, losses, root, candidates=effort.candidates, phases=effort.phases_of_gait, metres=metres,
         trying=lambda what: progress.update(done, what),
@@ -258,15 +230,32 @@ def _to_overtaking(problem: Problem, run: Run, losses: Tensor, root: RootGuess, 
 
 
 def _overtaking(problem: Problem, best: Run, root: RootGuess, effort: Effort) -> Run:
-    """Of who travels the best one goes on beside itself with legs that overtake each other."""
+    """Of who travels the best one goes on beside itself with the legs of a pair that overtake each other."""
     rivals = []
     if root.travelled > 1 and effort.schedules[-1].iterations:
         rivals = overtaking(problem, best.x, best.guess)
     return _beside(best, "overtaking", rivals) if rivals else replace(best, phase=len(PHASES))
 
 
+def _to_the_other_pair(problem: Problem, run: Run, *_) -> Run:
+    """Where one pair had changed names, the other one may have: the best one goes on beside itself with that one's
+    legs, too, overtaking each other."""
+    best = _in_turns(problem, run)
+    rivals = overtaking(problem, best.x, best.guess) if "overtaking" in best.labels[0] else []
+    return _beside(best, "the other pair", rivals) if rivals else replace(best, phase=len(PHASES))
+
+
 def _to_the_end(problem: Problem, run: Run, *_) -> Run:
-    return replace(_as_it_was(_winner(run, _by_picture(problem, run))), phase=len(PHASES))
+    return replace(_in_turns(problem, run), phase=len(PHASES))
+
+
+def _in_turns(problem: Problem, run: Run) -> Run:
+    return _as_it_was(_winner(run, preferences.turns(run.labels, _by_picture(problem, run), PHASES[run.phase])))
+
+
+_STEPS = (
+    _to_gait, _to_rivals, _to_final, _to_limbs, _to_alike, _to_overtaking, _to_the_other_pair, _to_the_end,
+)  # fmt: skip
 
 
 def _beside(best: Run, phase: str, rivals: list[tuple[str, Variables, Guess]]) -> Run:

@@ -22,7 +22,7 @@ from slomo.reconstruct.trajectory import Trajectory
 from slomo.skeleton import AUTO, USUAL, Skeleton, list_skeletons, load_skeleton
 from slomo.stage import Artifact, Inputs, Progress
 
-FIT_VERSION = 47
+FIT_VERSION = 48
 
 AGAIN = 0.5  # share of the rates with which the winner is fitted once more, beside one with other limbs
 POLISH = 0.4  # share of the rates with which the chunks of a long clip are polished together
@@ -261,7 +261,7 @@ def _effort(config: FitConfig) -> fitting.Effort:
             last,
             again,
             again,
-            last if limbs else replace(last, iterations=0),
+            *[last if limbs else replace(last, iterations=0)] * 2,
         ),
         candidates=config.candidates,
         phases_of_gait=config.gait_phases,

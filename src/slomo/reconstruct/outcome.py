@@ -102,7 +102,7 @@ def _margin(log: dict) -> float | None:
 def _swap_margin(log: dict) -> float | None:
     """Relative loss by which the winner beats its left-right opposite: among the rivals, else (where the opposite of
     another one was there) of its gait after the short fits; and, if that is less, the one with a pair of legs exchanged
-    in the end, for all of the clip or from every other meeting to the next. A person turned around is the one of the
+    in the end, for all of the clip or between moments in which they meet. A person turned around is the one of the
     end, where there is one. None where nothing was compared."""
     chosen = _named(log["final"][0])
     rivals = [(_named(e), e["loss"]) for e in log["rivals"]]
@@ -124,8 +124,8 @@ def _swap_margin(log: dict) -> float | None:
     margins = [min(other) / own - 1] if other and not turned else []
     opposite = [*turned, *(e for e in rest if e.get("exchanged") != best.get("exchanged"))]
     margins += [e["loss"] / best["loss"] - 1 for e in opposite]
-    if "overtaking" in log:
-        best, *rest = log["overtaking"]
+    for phase in ("overtaking", "the other pair"):
+        best, *rest = log.get(phase, [{}])
         margins += [e["picture"] / best["picture"] - 1 for e in rest]
     return round(min(margins), 4) if margins else None
 

@@ -1,5 +1,6 @@
 """Legs of a pair that overtake each other look much like legs that meet, change names and part again: each takes two
-short steps where one foot stands and the other one takes a long step."""
+short steps where one foot stands and the other one takes a long step. It shows: then the foot that is ahead after they
+have met is the one that was ahead before, and in gaits it is the other one."""
 
 from dataclasses import replace
 
@@ -15,45 +16,51 @@ from slomo.reconstruct.trajectory import Guess
 
 Array = np.ndarray
 
-OPEN = 0.15  # share by which the loss may be higher with nothing fitted to it, to be tried
+OPEN = 0.25  # share by which the loss may be higher with nothing fitted to it, to be tried
 NEARER = 0.35  # of how far apart feet are in the median, by which they come nearer where they meet
 _MOMENT = 0.02  # s, of which that is the mean
 
 
 def overtaking(problem: Problem, x: Variables, guess: Guess) -> list[tuple[str, Variables, Guess]]:
-    """The motion with the legs of one pair exchanged from every other moment in which they meet to the next, by the
-    pair's name, where the picture is hardly worse for it."""
+    """The motion with the legs of a pair exchanged where that makes them overtake each other whenever they meet, by the
+    pair's name, where the picture is not much worse for it: those that are wrong so are either these or all others."""
     if len(problem.obs.at) < 3:
         return []
     judge, (x, plain) = doubting(unsettled(problem), 0.0), as_guess(problem, x, guess)
     t, own, out = problem.obs.t.numpy(), feet(problem, x, plain)[0].numpy(), []
     at = t[problem.obs.at.numpy()]
+    with torch.no_grad():
+        _, R, _ = problem.path(x, plain, x["shape.log_length"].exp(), problem.obs.at)
+    forward, step = R[0, :, :, 0].numpy(), float(np.diff(at).mean())
     limit = (1 + OPEN) * float(rank(judge, x, plain)[0])
-    for name, links, pair in leg_pairs(problem.kin):
+    for name, links, (left, right) in leg_pairs(problem.kin):
         _, other = exchanged(problem, x, plain, links)
+        pair = [left, right]
         away = np.linalg.norm(own[:, pair] - feet(problem, x, other)[0].numpy()[:, pair], axis=-1).mean(-1)
-        turns = every_other(away, float(np.diff(at).mean()))
-        if turns is None:
+        turns = taking_turns(away, ((own[:, left] - own[:, right]) * forward).sum(-1), step)
+        if not turns.any():
             continue
         swapped = torch.as_tensor(np.interp(t, at, turns.astype(float)) > 0.5)
-        rivals = []
-        for where in (swapped, ~swapped):
+        for which, where in ((name, swapped), (f"{name}, the others", ~swapped)):
             q = plain.q.clone()
             q[:, :, links] = torch.where(where[:, None, None], other.q[:, :, links], q[:, :, links])
-            rivals.append(replace(plain, q=q))
-        loss, best = min((float(rank(judge, x, rival)[0]), n) for n, rival in enumerate(rivals))
-        if loss < limit:
-            out.append((name, x, rivals[best]))
+            rival = replace(plain, q=q)
+            if float(rank(judge, x, rival)[0]) < limit:
+                out.append((which, x, rival))
     return out
 
 
-def every_other(away: Array, step: float) -> Array | None:
-    """(F,) bool, the frames from every other moment in which two feet meet to the next; None where they do not twice.
+def taking_turns(away: Array, ahead: Array, step: float) -> Array:
+    """(F,) bool, where the legs have to be exchanged for the other foot to be ahead after every moment in which the two
+    meet, and for the same one as now at first.
 
     Args:
         away: (F,) by how much the feet move when their legs are exchanged.
+        ahead: (F,) by how much the left one is ahead.
         step: s from frame to frame.
     """
     away = gaussian_filter1d(away, _MOMENT / step)
     meetings, _ = find_peaks(-away, prominence=NEARER * np.median(away))
-    return np.searchsorted(meetings, np.arange(len(away)), "right") % 2 > 0 if len(meetings) > 1 else None
+    between = np.split(ahead, meetings)
+    first = np.array([np.median(part) > 0 for part in between]) ^ (np.arange(len(between)) % 2 > 0)
+    return np.repeat(first != first[0], [len(part) for part in between])

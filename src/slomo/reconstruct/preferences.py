@@ -8,6 +8,7 @@ Tensor = torch.Tensor
 
 STEPS = 0.04  # share by which the loss without a gait must be lower over more than a body length
 ALIKE = 0.01  # share by which the loss with strides that are alike may be higher
+TURNS = 0.0125  # share by which the loss with legs that overtake each other may be higher than with legs that do not
 _SWINGS = {"limbs", "strides", "alike"}  # keys of who does as the first one does but for some swings
 _BORROWED = {"alike", "again"}  # what they say of who does strides as others of them; not as the other side does
 
@@ -27,3 +28,8 @@ def alike(labels: list[dict], losses: Tensor, key: str) -> Tensor:
     beside = torch.tensor([keys <= _SWINGS for keys in differ])
     least = lambda x: x[beside].nan_to_num(nan=torch.inf).min()  # noqa: E731
     return torch.where(beside, favoured - least(favoured) + least(losses), losses)
+
+
+def turns(labels: list[dict], losses: Tensor, key: str) -> Tensor:
+    """Feet of a pair take turns to be ahead, which labels say under `key`."""
+    return losses * torch.tensor([1 - TURNS * (key in label) for label in labels])

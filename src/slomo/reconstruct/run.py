@@ -32,7 +32,7 @@ class Run:
     @property
     def loss(self) -> float:
         """Of the winner, once there is one."""
-        best = {phase: self.log[phase][0] for phase in ("overtaking", "alike") if phase in self.log}
+        best = {phase: self.log[phase][0] for phase in ("the other pair", "overtaking", "alike") if phase in self.log}
         return next((b["loss"] for phase, b in best.items() if phase in b), self.log["limbs"][0]["loss"])
 
 
