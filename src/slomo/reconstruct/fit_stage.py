@@ -42,8 +42,8 @@ class FitConfig:
         fps: fit frames a second at most. subject_px: size of the subject in working pixels (root of its area).
         width: neurons of the hidden layers of Q and G. joint_hz, root_hz: highest frequency of their time features.
         quality: draft, normal or high: how long it works on it.
-        iterations: of the heading, gait, rivals, final and limbs phase (the phase alike has those of limbs, the phase
-            overtaking those of final, where limbs has any); none: as the quality says.
+        iterations: of the heading, gait, rivals, final and limbs phase (the phase alike has those of limbs, overtaking
+            and the other pair those of final, where limbs has any); none: as the quality says.
         candidates: hypotheses that are fitted in the gait phase, at least one without a gait for each heading that is
             left (one or two); gait_phases: phases tried of each gait.
         tilt_moving_deg, tilt_static_deg: s.d. of the given gravity for a camera that moved, and for one that did not.
