@@ -22,8 +22,9 @@ _MOMENT = 0.02  # s, of which that is the mean
 
 
 def overtaking(problem: Problem, x: Variables, guess: Guess) -> list[tuple[str, Variables, Guess]]:
-    """The motion with the legs of a pair exchanged where that makes them overtake each other whenever they meet, by the
-    pair's name, where the picture is not much worse for it: those that are wrong so are either these or all others."""
+    """The motion with the legs of a pair exchanged in those stretches that make them overtake each other whenever they
+    meet, and in all others, by the pair's name; where they do not yet, and where the picture is not much worse for it.
+    """
     if len(problem.obs.at) < 3:
         return []
     judge, (x, plain) = doubting(unsettled(problem), 0.0), as_guess(problem, x, guess)
