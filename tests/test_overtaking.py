@@ -82,7 +82,7 @@ def test_what_the_picture_denies_is_not_tried(monkeypatch):
 
 @pytest.mark.parametrize(("loss", "won"), [(0.4, True), (0.504, True), (0.51, False)])
 def test_the_other_pair_is_tried_where_one_has_changed_names(monkeypatch, loss: float, won: bool):
-    """Which legs that overtake each other are believed to have, though the picture be worse for it by 1.25 %."""
+    """Which legs that overtake each other are believed to have, though the picture be worse for it by 1.2 %."""
     problem, _, x, shuffled, _ = walking(MEET)
     labels = [{"gait": "none"}, {"gait": "none", "overtaking": "front"}]
     x = {k: torch.cat([v, v]) for k, v in x.items()}

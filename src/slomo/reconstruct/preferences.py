@@ -8,7 +8,7 @@ Tensor = torch.Tensor
 
 STEPS = 0.04  # share by which the loss without a gait must be lower over more than a body length
 ALIKE = 0.01  # share by which the loss with strides that are alike may be higher
-TURNS = 0.0125  # share by which the loss with legs that overtake each other may be higher than with legs that do not
+TURNS = 0.012  # share by which the loss with legs that overtake each other may be higher than with legs that do not
 _SWINGS = {"limbs", "strides", "alike"}  # keys of who does as the first one does but for some swings
 _BORROWED = {"alike", "again"}  # what they say of who does strides as others of them; not as the other side does
 
