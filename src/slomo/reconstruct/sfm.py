@@ -124,7 +124,7 @@ def reconstruct_structure(
         }
         (root / "job.json").write_text(json.dumps(job))
         (root / "out.npz").unlink(missing_ok=True)
-        status = _run([sys.executable, "-m", "slomo.reconstruct.colmap", str(root)], root / "errors.txt", waiting)
+        status = _run([sys.executable, "-P", "-m", "slomo.reconstruct.colmap", str(root)], root / "errors.txt", waiting)
         if status in _CRASHED:  # COLMAP does on some pictures of a few textures; killed is another thing
             return None
         if status:
