@@ -13,10 +13,12 @@ from slomo.reconstruct.video import decode, fit_in
 from slomo.stage import Inputs, Silent
 
 
-def write_clip(path: Path, times, *, size=(96, 64), codec="mpeg4", faststart=True) -> Path:
+def write_clip(path: Path, times, *, size=(96, 64), codec="mpeg4", faststart=True, tags=()) -> Path:
     """A clip whose frame shown at time s has the gray level 60 s, with a white upper left corner."""
-    options = {"movflags": "faststart"} if faststart and path.suffix == ".mp4" else {}
+    flags = ["faststart"] * faststart + ["use_metadata_tags"] * bool(tags)
+    options = {"movflags": "+".join(flags)} if flags and path.suffix == ".mp4" else {}
     with av.open(str(path), "w", options=options) as container:
+        container.metadata.update(tags)
         stream = container.add_stream(codec, rate=30, options={})
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
         stream.bit_rate = 4_000_000
@@ -69,6 +71,55 @@ def test_start_and_duration(tmp_path):
     assert len(clip.t) == 30
     assert clip.t[0] == 0
     np.testing.assert_allclose(level(clip.frames), clip.t + 2.0, atol=0.06)
+
+
+def test_slow_motion_has_the_times_of_life(tmp_path):
+    path = write_clip(tmp_path / "a.mp4", np.arange(120) / 30)
+    clip = decode(path, slow_motion=4.0)
+    assert clip.info["slow_motion"] == 4
+    np.testing.assert_allclose(clip.t, np.arange(30) / 30)  # of 120 a second every fourth
+    np.testing.assert_allclose(level(clip.frames), 4 * clip.t, atol=0.06)
+
+
+def test_the_span_of_slow_motion_is_one_of_the_clip_as_it_plays(tmp_path):
+    path = write_clip(tmp_path / "a.mp4", np.arange(120) / 30)
+    clip = decode(path, start=1.0, duration=2.0, slow_motion=4.0)
+    np.testing.assert_allclose(clip.t, np.arange(15) / 30)
+    np.testing.assert_allclose(level(clip.frames), 1.0 + 4 * clip.t, atol=0.06)
+    # What asks for a second of the clip (`--subject-at`, key points of the user's) is told of the clip's own, too.
+    assert clip.info["start_s"] == pytest.approx(1.0)
+    assert clip.info["fps"] == pytest.approx(7.5)
+
+
+def test_slow_motion_that_keeps_all_of_its_few_frames(tmp_path):
+    clip = decode(write_clip(tmp_path / "a.mp4", np.arange(20) / 10), slow_motion=2.0)
+    np.testing.assert_allclose(clip.t, np.arange(20) / 20)
+
+
+@pytest.mark.parametrize(
+    ("capture", "slow"), [("240.000000", 8), ("119.88", 3.996), ("30.0", 1), ("60", 1), ("2", 1), ("inf", 1), ("?", 1)]
+)
+def test_slow_motion_that_the_file_tells_of(tmp_path, capture, slow):
+    path = write_clip(tmp_path / "a.mp4", np.arange(120) / 30, tags={"com.android.capture.fps": capture})
+    assert decode(path).info["slow_motion"] == pytest.approx(slow)
+    assert decode(path, slow_motion=1.0).info["slow_motion"] == 1
+
+
+def test_slow_motion_is_said(tmp_path):
+    path = write_clip(tmp_path / "a.mp4", np.arange(120) / 30, tags={"com.android.capture.fps": "120"})
+    told = []
+
+    class Heard(Silent):
+        def note(self, message):
+            told.append(message)
+
+    decode_stage.run(Inputs(files={"clip": path}), decode_stage.Config(), Heard())
+    assert told == ["decode: the clip plays 4 times slower than life, its file says (--slow-motion 1 if it does not)"]
+    told.clear()
+    decode_stage.run(Inputs(files={"clip": path}), decode_stage.Config(slow_motion=2.0), Heard())
+    assert told == ["decode: the clip plays 2 times slower than life"]
+    with pytest.raises(UsageError, match="slow_motion"):
+        decode_stage.run(Inputs(files={"clip": path}), decode_stage.Config(slow_motion=-1.0), Heard())
 
 
 @pytest.mark.parametrize(("quarter_turns", "corner"), [(1, (0, -1)), (2, (-1, -1)), (3, (-1, 0))])

@@ -20,6 +20,10 @@ WeightsOption = Annotated[
 ]
 StartOption = Annotated[float | None, typer.Option("--start", help="First second of the clip to use.")]
 DurationOption = Annotated[float | None, typer.Option("--duration", help="Seconds to use; 0: all.")]
+SlowMotionOption = Annotated[
+    float | None,
+    typer.Option("--slow-motion", help="How many times slower than life the clip plays; 0: as its file says."),
+]
 QualityOption = Annotated[
     str | None, typer.Option("--quality", metavar="draft|normal|high", help="How long to work on the reconstruction.")
 ]

@@ -18,6 +18,7 @@ from slomo.cli.options import (
     QualityOption,
     SegmenterOption,
     SkeletonOption,
+    SlowMotionOption,
     SolverOption,
     StartOption,
     TruthOption,
@@ -79,6 +80,7 @@ def _from_clip(
     weights: str | None,
     start: float | None,
     duration: float | None,
+    slow_motion: float | None,
     length: float | None,
     quality: str | None,
     fov: float | None,
@@ -90,7 +92,7 @@ def _from_clip(
     inputs = {role: session.path_or_none(path, role) for role, path in files.items() if path is not None}
     changes["inputs"] = changes.get("inputs", {}) | inputs | evidence["inputs"]
     changes["evidence"] = evidence["evidence"]
-    changes["decode"] = _given(start=start, duration=duration)
+    changes["decode"] = _given(start=start, duration=duration, slow_motion=slow_motion)
     changes["masks"] = who
     if masks not in (None, "none"):
         changes["masks"].setdefault("segmenter", None)  # the default takes the masks that are given
@@ -118,6 +120,7 @@ def add_commands(app: typer.Typer) -> None:
         weights: WeightsOption = None,
         start: StartOption = None,
         duration: DurationOption = None,
+        slow_motion: SlowMotionOption = None,
         length: LengthOption = None,
         quality: QualityOption = None,
         fov: FovOption = None,
@@ -134,12 +137,15 @@ def add_commands(app: typer.Typer) -> None:
         slomo reconstruct cat.mp4
         slomo reconstruct cat.mp4 --duration 4 --length 0.45 --quality draft
         slomo reconstruct man.mp4 --skeleton human
+        slomo reconstruct dog.mp4 --slow-motion 8     # taken at 240 frames a second, plays at 30
         slomo reconstruct two.mp4 --subject-at 640,300,1.5
         slomo reconstruct cat.mp4 --prior none --keypoints2d points.json
         """
         evidence = _evidence(session, prior, keypoints2d, keypoint_model, keypoint_map)
         who = chosen_subject(segmenter, subject_at, subject_box)
-        changes = _from_clip(session, skeleton, who, masks, weights, start, duration, length, quality, fov, evidence)
+        changes = _from_clip(
+            session, skeleton, who, masks, weights, start, duration, slow_motion, length, quality, fov, evidence
+        )
         if clip is not None:
             changes["inputs"] |= {"clip": session.user_path(clip, "clip")} | session.choice_reopened("clip")
         project = session.configure(changes)
@@ -255,6 +261,7 @@ def add_commands(app: typer.Typer) -> None:
         weights: WeightsOption = None,
         start: StartOption = None,
         duration: DurationOption = None,
+        slow_motion: SlowMotionOption = None,
         length: LengthOption = None,
         quality: QualityOption = None,
         fov: FovOption = None,
@@ -273,7 +280,9 @@ def add_commands(app: typer.Typer) -> None:
         """
         evidence = _evidence(session, prior, keypoints2d, keypoint_model, keypoint_map)
         who = chosen_subject(segmenter, subject_at, subject_box)
-        changes = _from_clip(session, skeleton, who, masks, weights, start, duration, length, quality, fov, evidence)
+        changes = _from_clip(
+            session, skeleton, who, masks, weights, start, duration, slow_motion, length, quality, fov, evidence
+        )
         inputs = changes["inputs"]
         inputs |= _truth(session, truth)
         if source is not None:

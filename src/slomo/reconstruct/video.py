@@ -17,6 +17,9 @@ LEAST_SIDE = 320  # px, likewise
 _FASTER = 0.01  # a source that is faster than wanted by no more than this (30.02 fps) is taken as it is
 _DIAGONAL_35MM = 43.267  # mm, diagonal of the full frame that "35 mm equivalent" focal lengths refer to
 _FOCAL_TAG = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
+_CAPTURE_TAG = "com.android.capture.fps"  # frames that the camera took a second, of slow motion more than are played
+# Times as many: four and more are usual. A plain clip taken in the dark has half as many as it was meant to have.
+_SLOWED = (2.5, 64.0)
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,7 @@ class Clip:
 
     Attributes:
         frames: (T, H, W, 3) uint8 RGB, upright.
-        t: (T,) s, uniform, from the first frame kept.
+        t: (T,) s of life, uniform, from the first frame kept.
         info: what `video.json` holds.
     """
 
@@ -43,6 +46,7 @@ def decode(
     max_side: int = 640,
     enlarge: float = 1.0,
     megapixels: float = 280.0,
+    slow_motion: float = 0.0,
     progress=lambda fraction: None,
 ) -> Clip:
     """Decode `path`, resampling to at most `fps` and scaling the longer side to `max_side` px.
@@ -50,9 +54,11 @@ def decode(
     Args:
         start: s from the clip's first frame.
         duration: s; 0 means up to the end.
-        fps: upper bound of the frame rate. A slower source keeps its own; of a faster one every n-th frame is taken if
-            its rate is constant, else the frames nearest to a grid at `fps`.
+        fps: upper bound of the frame rate, in a second of life. A slower source keeps its own; of a faster one every
+            n-th frame is taken if its rate is constant, else the frames nearest to a grid at `fps`.
         enlarge: by that much at most, a smaller clip.  megapixels: million pixels of all frames together; see `fit_in`.
+        slow_motion: how many times slower than life the clip plays; 0: as the file says, and else 1.  `start` and
+            `duration` are seconds of the clip as it plays, the times that come out are those of life.
 
     Raises:
         InvalidData: the file is no video, holds no frame in the wanted span, or fewer than 8.
@@ -71,11 +77,12 @@ def decode(
         header_length = float((stream.duration or 0) * (stream.time_base or 1))
         may_hide = "mov" in container.format.name  # MP4 as well
     source_fps, periods = _frame_rate(pts, header_rate)
-    rate = min(source_fps, fps)
+    slow = slow_motion or _slowed(info["capture_fps"], source_fps)
+    rate = min(source_fps, fps / slow)
     length = float(pts[-1] - pts[0]) + (1.0 / source_fps if source_fps else 0.0)
     if periods:
         # On a grid of another rate some steps would be longer than others, and so would be the speeds seen in them.
-        rate = source_fps / max(1, int(np.ceil(source_fps / fps - _FASTER)))
+        rate = source_fps / max(1, int(np.ceil(source_fps * slow / fps - _FASTER)))
         length = periods / source_fps
     stop = min(length, start + duration) if duration > 0 else length
     wanted = int(np.floor((stop - start) * rate + 1e-6)) if stop > start else 0
@@ -84,7 +91,7 @@ def decode(
         start = round(start * source_fps) / source_fps
 
     size = (info["source_width"] * info["pixel_aspect"], info["source_height"])
-    every, side, kept = fit_in(wanted, rate, size, max_side, enlarge, megapixels)
+    every, side, kept = fit_in(wanted, rate * slow, size, max_side, enlarge, megapixels)
     rate /= every
     grid = start + np.arange(kept) / rate
     with closing(_frames(path, float(pts[0]), start)) as frames:
@@ -97,6 +104,7 @@ def decode(
     info |= {
         "fps": rate,
         "source_fps": source_fps,
+        "slow_motion": slow,
         "width": int(stack.shape[2]),
         "height": int(stack.shape[1]),
         "rotation": rotation,
@@ -109,7 +117,7 @@ def decode(
     }
     if info["focal_35mm"]:
         info["focal_px_hint"] = info["focal_35mm"] / _DIAGONAL_35MM * float(np.hypot(*stack.shape[1:3]))
-    return Clip(stack, np.arange(len(stack)) / rate, info)
+    return Clip(stack, np.arange(len(stack)) / (rate * slow), info)
 
 
 def fit_in(
@@ -207,6 +215,12 @@ def _frame_rate(pts: np.ndarray, header: float) -> tuple[float, int]:
     return 1.0 / typical, 0
 
 
+def _slowed(capture_fps: float, source_fps: float) -> float:
+    """How many times slower than life a clip plays, by the rate that its camera says it took it at (0: unknown)."""
+    ratio = capture_fps / source_fps if source_fps else 0.0
+    return ratio if _SLOWED[0] < ratio < _SLOWED[1] else 1.0
+
+
 def _frames(path: Path, origin: float, start: float) -> Generator[tuple[float, av.VideoFrame], None, None]:
     """Decoded frames with their time (s from the clip's first frame), from one at `start` or before it."""
     if start > 1.0:
@@ -246,16 +260,20 @@ def _decoded(stream, origin: float) -> Iterator[tuple[float, av.VideoFrame]]:
 def _stream_info(container) -> dict:
     stream = container.streams.video[0]
     tags = {**container.metadata, **stream.metadata}
-    try:
-        focal = float(tags.get(_FOCAL_TAG, 0.0))
-    except ValueError:
-        focal = 0.0
+
+    def number(tag: str) -> float:
+        try:
+            return float(tags.get(tag, 0.0))
+        except ValueError:
+            return 0.0
+
     return {
         "codec": stream.codec_context.name,
         "source_width": stream.width,
         "source_height": stream.height,
         "pixel_aspect": float(stream.sample_aspect_ratio or 0) or 1.0,  # width over height of a source pixel
-        "focal_35mm": focal,
+        "focal_35mm": number(_FOCAL_TAG),
+        "capture_fps": number(_CAPTURE_TAG),
     }
 
 
