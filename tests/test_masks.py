@@ -264,7 +264,7 @@ def test_motion_segmenter(camera):
     masks = unpack(out.npz["masks.npz"])
     assert iou(masks, truth).mean() > 0.85
     assert out.json["report.json"]["segmenter"] == "motion"
-    assert any("motion" in note for note in notes)
+    assert any("slomo weights fetch" in note for note in notes)
     assert out.npz["masks.npz"]["quality"].shape == (24,)
     assert out.npz["flow.npz"]["flow"].dtype == np.float16
 

@@ -11,7 +11,7 @@ GOOD = Facts(
         silhouette_iou=0.85, silhouette_iou_low=0.8, silhouette_low_s=1.2, flow_residual_px=0.4, swap_margin=0.05,
         foot_skate_mps=0.01,
     ),
-    masks=dict(quality_mean=0.9, frames_without_subject=0),
+    masks=dict(segmenter="u2netp", quality_mean=0.9, frames_without_subject=0),
     camera=dict(reprojection_error_px=0.3, gravity_std_deg=1.0),
     feet=np.full((30, 4, 3), 0.02), sole=0.02, t=np.arange(30) / 15, length=0.5, stretch=np.ones(10),
 )  # fmt: skip
@@ -34,6 +34,7 @@ def test_nothing_speaks_against_a_good_one():
         (dict(report=dict(swap_margin=0.002)), "fair", "swap_margin"),
         (dict(report=dict(silhouette_iou=0.3)), "unusable", "silhouette_iou"),
         (dict(report=dict(silhouette_iou_low=0.7)), "fair", "silhouette_iou_low"),
+        (dict(masks=dict(segmenter="motion")), "fair", "masks_by_motion"),
         (dict(masks=dict(frames_without_subject=25)), "unusable", "frames_without_subject"),
         (dict(camera=dict(reprojection_error_px=9.0)), "fair", "camera_error_px"),
         (dict(feet=np.full((30, 4, 3), -0.1)), "poor or worse", "penetration"),

@@ -26,7 +26,7 @@ from slomo.reconstruct.run import Run, from_arrays
 from slomo.reconstruct.verdict import Facts, checks, verdict
 from slomo.stage import Artifact, Inputs, Progress
 
-REFINE_VERSION = 18
+REFINE_VERSION = 19
 SHORT = 0.05  # body lengths, added to bones and the skeleton's own: by how much short ones change says little
 TREMBLES = 0.1  # degrees of a camera's rotation, of which the user is told
 

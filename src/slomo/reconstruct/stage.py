@@ -98,6 +98,8 @@ def run_masks(inputs: Inputs, config: MasksConfig, progress: Progress) -> Artifa
     flow = dense_flow(frames, lambda f: progress.update(0.25 * f, "optical flow"))
     segmenter, found = _segmented(segmenter, config, choice, frames, flow, progress)
     progress.note(f"masks: segmenter {segmenter.name}")
+    if segmenter.name == "motion" and config.segmenter == "auto":
+        progress.note("masks: by motion alone, which takes shadows and more for the subject: run `slomo weights fetch`")
     quality = frame_quality(found.masks, flow, found.certainty)
     seen = np.asarray(found.masks.any((1, 2)))
     own = closer(frames, found.masks, lambda f: progress.update(0.95 + 0.05 * f, "the subject's optical flow"))

@@ -10,6 +10,7 @@ Array = np.ndarray
 
 ALOFT = 0.5  # s: nothing that walks, trots or jumps on the spot is off the ground for longer
 OVERLAP = 0.72  # of silhouettes: the rest pose at the right place has 0.5 to 0.6, a fit that is right 0.75 and more
+_BY_MOTION = "shadows and boxes may be in the masks: run `slomo weights fetch`, then this again"
 NEAR = 0.08  # body lengths above its stance height at which a foot still is at the ground
 
 
@@ -76,6 +77,7 @@ def checks(f: Facts) -> list[Check]:
     low = f.report["silhouette_iou_low"] if f.report["silhouette_iou"] >= OVERLAP else None
     height = (f.feet[..., 2] - f.sole) / f.length
     return [
+        Check("masks_by_motion", float(f.masks.get("segmenter") == "motion"), 0, None, _BY_MOTION),
         Check("mask_quality", f.masks.get("quality_mean"), 0.7, 0.3, look, least=True),
         Check("frames_without_subject", f.masks.get("frames_without_subject", 0) / frames, 0.1, 0.6, look),
         Check("camera_error_px", f.camera.get("reprojection_error_px"), 1.5, None, "a camera in doubt: give --fov"),
