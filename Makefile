@@ -7,6 +7,7 @@
 # make bench-prior   those networks, alone and over a clip, against truth      (WEIGHTS=folder: others; BENCH="--truth ... --projects ...")
 # make bench-parts   reconstruction without each of its parts
 # make bench-terms   reconstruction with and without each term of the prior   (BENCH="--seeds 5 --terms some")
+# make bench-clips   reconstruction over rendered clips of many kinds, a table     (BENCH="--only gallop --jobs 2")
 # make bench-robust  reconstruction from spoiled masks, cameras, frames and bones
 # make conformance   the robot's wire format against its vendor's own SDK, on loopback; skipped where pip has no such SDK
 PYTHON ?= python3
@@ -19,7 +20,7 @@ STEPS_human     := 7000
 PRIOR  := prior-training
 SHIPPED := src/slomo/prior/weights
 
-.PHONY: demo test slow check conformance clean train-prior bench bench-mpc bench-random bench-prior bench-terms bench-parts bench-robust \
+.PHONY: demo test slow check conformance clean train-prior bench bench-mpc bench-random bench-prior bench-terms bench-parts bench-clips bench-robust \
   $(KINDS:%=train-%)
 .DELETE_ON_ERROR:
 
@@ -69,6 +70,9 @@ bench-terms: .venv/dev.stamp
 
 bench-parts: .venv/dev.stamp
 	.venv/bin/python tests/bench_terms.py bench --terms parts $(BENCH)
+
+bench-clips: .venv/dev.stamp
+	.venv/bin/python tests/bench_clips.py bench $(BENCH)
 
 bench-robust: .venv/dev.stamp
 	OMP_NUM_THREADS=1 .venv/bin/python tests/bench_robust.py bench $(BENCH)

@@ -10,6 +10,12 @@ from slomo.reconstruct.tracks import Tracks
 
 _NOISE = 9.0  # levels (of 255) in RGB that noise and sub-pixel shifts leave
 _UNLIKE = 2.7  # times those levels, from which on nothing but shade explains a pixel by the background
+PATTERN = 0.85  # correlation with the background, of what shows its pattern
+_CONTRAST = 3.0  # levels, s.d. of a background that has a pattern
+_LIKE = 1.25  # times those levels, up to which a pixel is the background's own
+_OFTEN = 4  # frames that must show it
+_AROUND = 0.7  # of the pixels around it, that must as well: single ones of a leg look like the ground by chance
+_SURELY = -6.0  # log odds then: what moves there is a shadow, or the ground between legs
 SHADOW = (0.3, 0.95)  # a cast shadow multiplies the ground's colour by a factor in this range
 
 
@@ -40,7 +46,8 @@ class Overlay:
         return model if model is not None and inliers.mean() > 0.4 else None
 
     def evidence(self, t: int, covered: dict[int, np.ndarray], others: list[int]) -> np.ndarray:
-        """(h, w) log odds, about -2 to 4, that a pixel of frame t is no background; 0 where that cannot be said.
+        """(h, w) log odds, about -2 to 4, that a pixel of frame t is no background; 0 where that cannot be said, and -6
+        where it surely is: seen alike, or darker with the same pattern, in several other frames.
 
         Args:
             covered: frame -> (h, w) bool, where the subject may be; such samples do not count.
@@ -65,7 +72,13 @@ class Overlay:
         now = self.rgb[t].astype(np.float32)
         median = np.where(np.isfinite(median), median, now)
         spread = (np.abs(x - median).mean(-1) * ok).sum(0) / np.maximum(count, 1)
-        return np.where(count >= 2, log_odds(now, median, spread), 0.0).astype(np.float32)
+        odds, factor = log_odds(now, median, spread), shade_factor(now, median)
+        like = np.linalg.norm(now - median, axis=-1) < _LIKE * (_NOISE + 1.5 * spread)
+        shade = (factor > SHADOW[0]) & (factor < SHADOW[1]) & (alike(now.mean(-1), median.mean(-1)) > PATTERN)
+        sure = (count >= _OFTEN) & (odds < 0) & (like | shade)
+        sure &= cv2.boxFilter(sure.astype(np.float32), -1, (5, 5)) > _AROUND
+        odds = np.where(sure, _SURELY, odds)
+        return np.where(count >= 2, odds, 0.0).astype(np.float32)
 
 
 def log_odds(
@@ -97,3 +110,11 @@ def log_odds(
 def shade_factor(now: np.ndarray, median: np.ndarray) -> np.ndarray:
     """(h, w) by which the background (h, w, 3) is multiplied to look most like (h, w, 3) now."""
     return (now * median).sum(-1) / np.maximum((median**2).sum(-1), 1.0)
+
+
+def alike(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(h, w) correlation of two pictures (h, w) around every pixel, 0 where the second has no pattern."""
+    mean = lambda x: cv2.boxFilter(x.astype(np.float32), -1, (9, 9))  # noqa: E731
+    ma, mb = mean(a), mean(b)
+    va, vb = mean(a * a) - ma * ma, mean(b * b) - mb * mb
+    return np.where(vb > _CONTRAST**2, (mean(a * b) - ma * mb) / np.sqrt(np.maximum(va * vb, 1e-6)), 0.0)

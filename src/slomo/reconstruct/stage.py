@@ -13,7 +13,7 @@ from slomo.packed import pack, unpack
 from slomo.runs import runs
 from slomo.stage import Artifact, Inputs, Progress
 
-MASKS_VERSION = 26
+MASKS_VERSION = 27
 CAMERA_VERSION = 12
 QUALITIES = ("draft", "normal", "high")
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from slomo.reconstruct.background import SHADOW, log_odds, shade_factor
+from slomo.reconstruct.background import PATTERN, SHADOW, alike, log_odds, shade_factor
 from slomo.reconstruct.colour import learn_colours, to_lab
 from slomo.reconstruct.flow import Flow
 from slomo.reconstruct.instances import Choice, follow
@@ -31,8 +31,6 @@ _SOFT_PX = 0.8  # of the smoothing before frames are compared
 _SEEN = 0.6  # of the time, for which the subject may cover a place whose background is known
 _LEAST = 0.0015  # of the picture, a subject
 _SHADE = -0.1  # log odds of what could be the background in shade: the colours decide, a dark coat looks so too
-_PATTERN = 0.85  # correlation with the background, of what shows its pattern
-_CONTRAST = 3.0  # levels, s.d. of a background that has a pattern
 _SHADOWS = 200  # pixels of that, which tell how dark shadows are
 _DEEPER = 0.08  # of the factor, by which shadows may be darker than that tells
 _SURELY = 2.0  # log odds, of what belongs to the subject though nothing joins it
@@ -144,18 +142,10 @@ def _darkest_shade(frames: np.ndarray, body: dict[int, np.ndarray], median: np.n
     for t in list(body)[:: max(1, len(body) // _SAMPLES)]:
         now = _soft(frames[t])
         open_ = np.abs(_differs(frames[t], median, spread, SHADOW[0]) - _SHADE) < 1e-6
-        pattern = open_ & grown(body[t], 0.3) & (_alike(now.mean(-1), median.mean(-1)) > _PATTERN)
+        pattern = open_ & grown(body[t], 0.3) & (alike(now.mean(-1), median.mean(-1)) > PATTERN)
         found.append(shade_factor(now, median)[pattern])
     factors = np.concatenate(found)
     return max(SHADOW[0], float(np.quantile(factors, 0.1)) - _DEEPER) if len(factors) > _SHADOWS else SHADOW[0]
-
-
-def _alike(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(H, W) correlation of two pictures (H, W) around every pixel."""
-    mean = lambda x: cv2.boxFilter(x.astype(np.float32), -1, (9, 9))  # noqa: E731
-    ma, mb = mean(a), mean(b)
-    va, vb = mean(a * a) - ma * ma, mean(b * b) - mb * mb
-    return np.where(vb > _CONTRAST**2, (mean(a * b) - ma * mb) / np.sqrt(np.maximum(va * vb, 1e-6)), 0.0)
 
 
 def _trimmed(mask: np.ndarray, frame: np.ndarray, median: np.ndarray) -> np.ndarray:
