@@ -24,6 +24,7 @@ MASKS_VERSION = CAMERA_VERSION = FIT_VERSION = REFINE_VERSION = VERSION = 1
 class DecodeConfig:
     start: float = 0.0  # s, from the first frame
     duration: float = 0.0  # s, 0: all
+    slow_motion: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)

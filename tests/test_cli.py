@@ -152,6 +152,9 @@ def test_options_are_written_into_the_users_file(project):
         "inputs": {"clip": "clip.txt"},
     }
     assert "slomo.toml" not in run("reconstruct", "--duration", "2").stderr
+    run("reconstruct", "--slow-motion", "8")
+    assert settings.read(project, list(pipeline.STAGES))["decode"]["slow_motion"] == 8.0
+    run("reconstruct", "--set", "decode.slow_motion=")
     (project / "bones.toml").write_text("")
     run("reconstruct", "--skeleton", "bones.toml", "--set", "decode.duration=")
     tables = settings.read(project, list(pipeline.STAGES))
@@ -198,7 +201,7 @@ def test_masks_given_are_used(project):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[decode]\nstrat = 1.0", "[decode]: no parameter 'strat' (valid: start, duration); did you mean 'start'?"),
+        ("[decode]\nstrat = 1.0", "[decode]: no parameter 'strat' (valid: start, duration, slow_motion); did you mean 'start'?"),
         (
             "[decoed]\nstart = 1.0",
             "no section 'decoed' (valid: inputs, decode, masks, camera, evidence, fit, reconstruct",

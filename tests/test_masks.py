@@ -269,6 +269,18 @@ def test_motion_segmenter(camera):
     assert out.npz["flow.npz"]["flow"].dtype == np.float16
 
 
+def test_a_shadow_that_moves_along_is_none_of_the_subject():
+    frames, truth = moving_disc(48)
+    soft = np.stack([cv2.GaussianBlur(frame, (0, 0), 2.0) for frame in frames])  # or the ground's own flow would show
+    frames = np.where(truth[..., None], frames, soft)
+    shade = np.roll(truth, (18, 26), axis=(1, 2)) & ~truth  # falls below and ahead, and touches it
+    shade[:, :, :26] = False
+    frames = np.where(shade[..., None], 0.35 * frames, frames).astype(np.uint8)
+    masks = unpack(run_masks(inputs(frames), MasksConfig(), Silent()).npz["masks.npz"])
+    assert iou(masks, truth).mean() > 0.75
+    assert (masks & shade).sum() < 0.35 * shade.sum()
+
+
 def test_clip_without_a_subject():
     frames = np.repeat(np.uint8(noise(120, 200, 3))[None], 10, 0)
     with pytest.raises(InvalidData, match="no subject found") as caught:
