@@ -201,7 +201,10 @@ def test_masks_given_are_used(project):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[decode]\nstrat = 1.0", "[decode]: no parameter 'strat' (valid: start, duration, slow_motion); did you mean 'start'?"),
+        (
+            "[decode]\nstrat = 1.0",
+            "[decode]: no parameter 'strat' (valid: start, duration, slow_motion); did you mean 'start'?",
+        ),
         (
             "[decoed]\nstart = 1.0",
             "no section 'decoed' (valid: inputs, decode, masks, camera, evidence, fit, reconstruct",
