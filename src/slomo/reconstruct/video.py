@@ -10,6 +10,7 @@ import av.error
 import numpy as np
 
 from slomo.errors import InvalidData
+from slomo.reconstruct.video_times import frame_rate, slowed, timestamps
 
 MIN_FRAMES = 8
 LEAST_FPS = 12.0  # frames a second of a clip that is too long to take more of: five of the fastest stride
@@ -18,8 +19,6 @@ _FASTER = 0.01  # a source that is faster than wanted by no more than this (30.0
 _DIAGONAL_35MM = 43.267  # mm, diagonal of the full frame that "35 mm equivalent" focal lengths refer to
 _FOCAL_TAG = "com.apple.quicktime.camera.focal_length.35mm_equivalent"
 _CAPTURE_TAG = "com.android.capture.fps"  # frames that the camera took a second, of slow motion more than are played
-# Times as many: four and more are usual. A plain clip taken in the dark has half as many as it was meant to have.
-_SLOWED = (2.5, 64.0)
 
 
 @dataclass(frozen=True)
@@ -72,12 +71,12 @@ def decode(
     with closing(_open(path)) as container:
         info = _stream_info(container)
         stream = container.streams.video[0]
-        pts = _timestamps(container, path)
+        pts = timestamps(container, path)
         promised, header_rate = stream.frames, float(stream.average_rate or 0)
         header_length = float((stream.duration or 0) * (stream.time_base or 1))
         may_hide = "mov" in container.format.name  # MP4 as well
-    source_fps, periods = _frame_rate(pts, header_rate)
-    slow = slow_motion or _slowed(info["capture_fps"], source_fps)
+    source_fps, periods = frame_rate(pts, header_rate)
+    slow = slow_motion or slowed(info["capture_fps"], source_fps)
     rate = min(source_fps, fps / slow)
     length = float(pts[-1] - pts[0]) + (1.0 / source_fps if source_fps else 0.0)
     if periods:
@@ -167,58 +166,6 @@ def _open(path: Path):
         container.close()
         raise InvalidData("has no video stream", where=path, todo="give a video file")
     return container
-
-
-def _timestamps(container, path: Path) -> np.ndarray:
-    """Presentation times of all packets that are shown (s, sorted), without decoding.
-
-    Raises:
-        InvalidData: there are none.
-    """
-    stream = container.streams.video[0]
-    stamps, untimed = [], 0
-    try:
-        for packet in container.demux(stream):
-            stamp = packet.pts if packet.pts is not None else packet.dts
-            # An edit list (a trimmed clip) hides what is only there to decode the rest.
-            if packet.size and not packet.is_corrupt and not packet.is_discard:
-                if stamp is None:
-                    untimed += 1
-                else:
-                    stamps.append(stamp * float(stream.time_base or 1))
-    except av.error.FFmpegError:
-        pass  # what follows the damage cannot be read; the frames before it can
-    if stamps:
-        return np.unique(stamps)
-    if untimed:  # counting them would need a frame rate, and that of a raw stream's header is a guess
-        todo = f"give them at the rate they were taken with, for example ffmpeg -r 30 -i {path.name} {path.stem}.mp4"
-        raise InvalidData("is a raw stream, its frames have no times", where=path, todo=todo)
-    raise InvalidData("the video stream holds no frames", where=path, todo="copy the clip again, it may be truncated")
-
-
-def _frame_rate(pts: np.ndarray, header: float) -> tuple[float, int]:
-    """Frames a second, and how many periods the clip lasts where the rate is constant (frames may be missing), else 0.
-
-    Args:
-        pts: (n,) s, sorted.
-        header: frames a second that the container states, 0 where it states none.
-    """
-    if len(pts) < 2:
-        return 0.0, 0
-    typical = float(np.median(np.diff(pts)))
-    number = np.cumsum(np.round(np.diff(pts) / typical))
-    # The header's rate is the exact one if the times agree with it. Those of Matroska are whole milliseconds: 17 for
-    # a sixtieth of a second, and at 240 fps almost a quarter of a period off.
-    for rate in (header, float(number[-1] / (pts[-1] - pts[0]))):
-        if rate and np.abs((pts[1:] - pts[0]) * rate - number).max() < 0.25:
-            return rate, int(number[-1]) + 1
-    return 1.0 / typical, 0
-
-
-def _slowed(capture_fps: float, source_fps: float) -> float:
-    """How many times slower than life a clip plays, by the rate that its camera says it took it at (0: unknown)."""
-    ratio = capture_fps / source_fps if source_fps else 0.0
-    return ratio if _SLOWED[0] < ratio < _SLOWED[1] else 1.0
 
 
 def _frames(path: Path, origin: float, start: float) -> Generator[tuple[float, av.VideoFrame], None, None]:
