@@ -7,7 +7,7 @@ import numpy as np
 
 from slomo.errors import InvalidData
 
-# Times as many frames taken as played: four and more are usual; a plain clip in the dark may hold half of what was meant.
+# Times as many frames taken as played: four and more are usual; a plain clip in the dark may hold half of its frames.
 _SLOWED = (2.5, 64.0)
 
 
