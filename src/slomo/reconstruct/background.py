@@ -10,9 +10,9 @@ from slomo.reconstruct.tracks import Tracks
 
 _NOISE = 9.0  # levels (of 255) in RGB that noise and sub-pixel shifts leave
 _UNLIKE = 2.7  # times those levels, from which on nothing but shade explains a pixel by the background
+_LIKE = 1.25  # times those levels, up to which a pixel is the background's own
 PATTERN = 0.85  # correlation with the background, of what shows its pattern
 _CONTRAST = 3.0  # levels, s.d. of a background that has a pattern
-_LIKE = 1.25  # times those levels, up to which a pixel is the background's own
 _OFTEN = 4  # frames that must show it
 _AROUND = 0.7  # of the pixels around it, that must as well: single ones of a leg look like the ground by chance
 _SURELY = -6.0  # log odds then: what moves there is a shadow, or the ground between legs
